@@ -235,7 +235,7 @@ class Calibrator:
 
     def _compare_sensors(self, solution: Solution | None, progress: Progress
                          ) -> SensorComparison:
-        if solution is None or self._motion is None:
+        if self._motion is None:
             return SensorComparison(solution)
         progress('evaluating the motion sensors', 0.0)
         found: SensorComparison | None = spared(

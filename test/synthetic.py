@@ -122,16 +122,18 @@ def synthetic_turn(camera: Camera = LENS, yaw_deg: float = 80.0, keyframes: int 
                    tracks: int = 350, noise_px: float = 0.2, outliers: float = 0.0, seed: int = 0,
                    world: int = 0, extra: tuple[float, float, float] = (0.0, 0.0, 0.0),
                    readout_s: float = 0.0, shaking_deg_s: float = 0.0,
-                   keyframe_s: float = KEYFRAME_S) -> SyntheticTurn:
+                   keyframe_s: float = KEYFRAME_S, uneven: float = 0.0) -> SyntheticTurn:
     """Return a turn through random points.
 
     seed: of the noise; world: of the path and the points. outliers: share of the observations that
     are 5 to 40 px off. extra: p1, p2, k3 of the lens that took the pictures.
     readout_s: of a rolling shutter. shaking_deg_s: how fast bumps pitch and roll the camera in
-    each keyframe, which no path through the keyframes shows. keyframe_s: between two keyframes.
+    each keyframe, which no path through the keyframes shows. keyframe_s: between two keyframes;
+    uneven: of it, up to which their true times differ from the even ones that they have.
     """
     rng = np.random.default_rng([world, 2])
-    path = path_of(yaw_deg, keyframe_s * np.arange(keyframes), world, shaking_deg_s)
+    late = uneven * np.random.default_rng([world, 4]).uniform(-1, 1, keyframes)
+    path = path_of(yaw_deg, keyframe_s * (np.arange(keyframes) + late), world, shaking_deg_s)
     rotations, translations = path.poses()
     centres = -np.einsum('kji,kj->ki', rotations, translations)
     many = 40 * tracks

@@ -620,6 +620,16 @@ def test_tiny_pictures(width, height):
     refused(pictures(80, width, height, 1))
 
 
+def test_sensors_of_a_refused_drive_are_named():
+    with limited(Calibrator(QUICK)) as calibrator:
+        for frame in pictures(80, 320, 180):
+            calibrator.push(frame)
+        calibrator.sense(SensorStream(rate=Samples(np.arange(9.0), np.zeros((9, 3)))))
+        found = calibrator.calibrate()
+    assert found.verdict.level == 'refused'
+    assert [each.code for each in found.warnings] == ['E-SENSOR-NO-TURNS']
+
+
 def test_noise_is_no_drive():
     refused(pictures(80, 320, 180, 7))
 

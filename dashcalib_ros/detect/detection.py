@@ -97,7 +97,12 @@ class Detection:
             return []
         self.standing = motion.standing
         if not motion.standing:
-            self._two_pictures.push(frame.image, frame.stamp_ns)
+            try:
+                self._two_pictures.push(frame.image, frame.stamp_ns)
+            except InputError:
+                # what seemed to be a turn was none
+                self._turns = TurnDetector(self._turns.config)
+                raise
             self._lines.push(frame.image, frame.stamp_ns)
         new = self._turns.push(frame, motion)
         self._stretches.push(frame, motion.shift, motion.after_gap)

@@ -14,7 +14,7 @@ from dashcalib_ros.config import MaskConfig, MotionConfig
 from dashcalib_ros.detect.continuity import goes_on
 from dashcalib_ros.detect.epipoles import epipoles_of, turning
 from dashcalib_ros.detect.mask import CELL, EgoMask
-from dashcalib_ros.detect.one_camera import OneCamera
+from dashcalib_ros.detect.one_camera import USUAL_STEP, OneCamera
 from dashcalib_ros.detect.points import Tracking, find_clear_corners, follow_points
 from dashcalib_ros.detect.segmentation import SegmentationMask, open_segmentation
 from dashcalib_ros.detect.straights import PAIRS, STRAIGHT, StraightCollector, Straights
@@ -204,9 +204,11 @@ class MotionEstimator:
                        after=resized_pixels(found.after, factor))
 
     def warnings(self) -> tuple[Notice, ...]:
-        """Return warnings about the masks for the user, one line each."""
-        warning = self._segmented and self._segmented.warning()
-        return (warning,) if warning else ()
+        """Return warnings about the images and the masks for the user, one line each."""
+        warning, jump = self._segmented and self._segmented.warning(), self.one_camera.jump
+        return (*((warning,) if warning else ()), *(() if jump is None else (Notice(
+            'E-VIEW-JUMPS', f'image {jump} shows another view than the one before, with no gap in '
+            f'time: check that all images are of one camera and that none is missing'),)))
 
     def _reset(self) -> None:
         """Drop all points: the next image does not continue the last one."""
@@ -261,13 +263,24 @@ class MotionEstimator:
 
     def _track(self, frame: Frame, image: GreyImage) -> tuple[_Seen, bool]:
         """Return the points in this image, and whether it does not follow the last one."""
+        before = self._xy
         followed = self._follow(image)
+        if self._last is not None:
+            self.one_camera.look_at_next(
+                (self._last, image), before, followed, frame.index, self._tracking,
+                self._perhaps_gap or self._is_late(frame))
         lost = self._perhaps_gap and bool(self._seen) and not self._goes_on(followed)
         if lost:
             followed = math.nan
             self._reset()
         self._perhaps_gap = False
         return _Seen(frame.index, frame.stamp_ns, self._ids, self._xy, followed), lost
+
+    def _is_late(self, frame: Frame) -> bool:
+        """Return whether more time than usual has passed since the last image."""
+        stamps = [seen.stamp_ns for seen in self._seen]
+        return (len(stamps) < 2 or frame.stamp_ns - stamps[-1]
+                > USUAL_STEP * float(np.median(np.diff(stamps))))
 
     def _compare_between(self, before: Floats32, now: Floats32) -> None:
         """Compare a skipped image with those around it; before, now: (n, 2) px in these."""

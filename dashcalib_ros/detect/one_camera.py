@@ -34,10 +34,10 @@ APART = 'record each camera separately, with one topic per camera'
 
 @dataclass(frozen=True)
 class OtherCamera:
-    """Another camera in the stream, seen in images that are skipped.
+    """Another camera in the stream, seen in images that are skipped, or from one image on.
 
-    shown: number of the newest comparisons that show it; looks: number of all of these. what:
-    they show, in words.
+    shown: number of the newest comparisons that show it; looks: number of all of these; 0 where
+    it is not seen in skipped ones. what: they show, in words.
     """
 
     shown: int
@@ -45,6 +45,8 @@ class OtherCamera:
     what: str
 
     def __str__(self) -> str:
+        if not self.looks:
+            return f'the images are of two cameras: {self.what}'
         return (f'the images are of two cameras: of {self.looks} skipped images that were '
                 f'compared, {self.shown} show {self.what}')
 
@@ -61,6 +63,11 @@ LEAST_FOUND, LEAST_NEAR = 0.35, 0.06
 OFF_WIDTH, OFF_STEP = 0.005, 0.15
 # of their median; looks that are nearer to it show the same camera
 ALIKE = 0.5
+# of the points; where so few go on into the next image and so many into its mirror image, that is
+# mirrored
+LOST, MIRRORED = 0.1, 0.5
+# of the steps between images of a drive; a longer one may lose all points
+USUAL_STEP = 1.5
 # of the grey values' spread; a darker image, as black ones of a broken driver, shows nothing
 LEAST_CONTRAST = 0.3
 
@@ -69,6 +76,8 @@ class OneCamera:
     """Compares skipped images with those around them.
 
     other: the other camera, once it was seen. mixed: whether the newest comparisons show it.
+    jump: the number of the first image that shows another view than the one before, with no gap
+    in time, where the images before and after it go on.
     """
 
     def __init__(self) -> None:
@@ -77,6 +86,11 @@ class OneCamera:
         # whether that is too far
         self._looks: deque[tuple[Floats, bool] | None] = deque(maxlen=RECENT)
         self.mixed = False
+        self.jump: int | None = None
+        # of the last two images: the share of points that was found in each; and the number of the
+        # last one, where it may be a jump
+        self._followed = (0.0, 0.0)
+        self._jumped: int | None = None
 
     def look(self, images: Sequence[GreyImage], before: Floats32, after: Floats32,
              tracking: Tracking) -> None:
@@ -102,6 +116,31 @@ class OneCamera:
             self._looks.append((np.zeros(4), False))
         now = self._judge()
         self.mixed, self.other = now is not None, now or self.other
+
+    def look_at_next(self, images: Sequence[GreyImage], before: Floats32, followed: float,
+                     index: int, tracking: Tracking, joint: bool) -> None:
+        """See whether an image that does not go on from the one before is of another camera.
+
+        images: the one before, and this one, whose number is index. before: (n, 2) px, the points
+        in the one before; followed: the share of them that was found in this one. joint: whether
+        something may be missing between them.
+        """
+        earlier, last = self._followed
+        if self.jump is None and last < LOST and earlier > MIRRORED and followed > MIRRORED:
+            self.jump = self._jumped
+        self._followed, self._jumped = (last, followed), None
+        first, now = images
+        if (len(before) < MIN_POINTS or not followed < LOST
+                or now.std() < LEAST_CONTRAST * first.std()):
+            return
+        there = np.array(before)
+        there[:, 0] = first.shape[1] - 1 - there[:, 0]
+        _, found = follow_points(np.ascontiguousarray(first[:, ::-1]), now, there, tracking)
+        if found.mean() > MIRRORED:
+            self.other = self.other or OtherCamera(
+                1, 0, f'image {index} is mirrored, and the one before is not')
+        elif not joint:
+            self._jumped = index
 
     def _judge(self) -> OtherCamera | None:
         views = sum(each is None for each in self._looks)
@@ -203,9 +242,14 @@ class TwoPictures:
 
 
 def _share(one: GreyImage, other: GreyImage) -> float | None:
-    """Return the share of patches of a picture that another one shows, None for too few."""
+    """Return the share of patches of a picture that another one shows, None for too few.
+
+    None for small pictures, too: enlarged, all patches are alike.
+    """
     height, width = one.shape
     scale = max(HALF[0] / width, HALF[1] / height)
+    if scale > 1:
+        return None
     size = round(width * scale), round(height * scale)
     apart = round(COLUMNS * size[0])
     small, there = (cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (one, other))

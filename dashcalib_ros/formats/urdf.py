@@ -54,13 +54,16 @@ def write(found: NamedCamera) -> str:
 def write_transform(found: NamedCamera) -> str:
     """Return the command that publishes the same as one transform, base_link to optical frame.
 
-    Raises ConfigError where the mounting is not known.
+    Without a known height it has none, which a comment before it says. Raises ConfigError where
+    the mounting is not known.
     """
     mount = _mount_of(found)
     turn = ' '.join(f'--q{axis} {_number(value)}'
                     for axis, value in zip('xyzw', mount.quaternion, strict=True))
-    return (f'ros2 run tf2_ros static_transform_publisher '
-            f'--x 0 --y 0 --z {_number(mount.height_m or 0.0)} {turn} '
+    known = mount.height_m is not None
+    return (('' if known else f'# the height above {BASE} is not known: add --z, in m\n')
+            + f'ros2 run tf2_ros static_transform_publisher --x 0 --y 0 '
+            f'{f"--z {_number(mount.height_m or 0.0)} " if known else ""}{turn} '
             f'--frame-id {BASE} --child-frame-id {_frame_name(found.name)}_optical_frame\n')
 
 

@@ -7,9 +7,10 @@ and of what is in them. Where an index fails, a file is read from its start to w
 """
 from __future__ import annotations
 
+import copy
 import re
 from collections import Counter
-from collections.abc import Callable, Collection, Generator, Iterator, Mapping
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import starmap
@@ -238,6 +239,19 @@ class BagSource(FrameSource):
             warnings.append(Notice('E-FPS-IGNORED', f'{path} is a bag, and its images have time '
                                    f'stamps: fps is ignored'))
         super().__init__(str(path), chosen.count, chosen.name, tuple(warnings))
+
+    def with_more(self, others: Sequence[BagSource]) -> BagSource:
+        """Return this with the other files of the same recording: their images come by time."""
+        found, bags = copy.copy(self), [self._bag, *(each._bag for each in others)]
+        found._bag = Bag(
+            tuple(file for bag in bags for file in bag.files), self._bag.topics,
+            all(bag.indexed for bag in bags), (), {
+                file: begin for bag in bags for file, begin in bag.begins_ns.items()})
+        found.name = f'{self.name} and {len(others)} more'
+        found.count = found._promised = sum(each.count or 0 for each in (self, *others))
+        found._opening_warnings = tuple(dict.fromkeys(
+            line for each in (self, *others) for line in each._opening_warnings))
+        return found
 
     @property
     def begin_ns(self) -> int | None:

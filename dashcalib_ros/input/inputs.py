@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
-from itertools import pairwise, zip_longest
+from itertools import groupby, pairwise, zip_longest
 from numbers import Real
 from pathlib import Path
 
@@ -232,9 +232,31 @@ def _joined(groups: Sequence[_Group], topic: str | None, fps: float | None) -> F
                 f'{_listed(ordered)}: pass their folder for that order'))
     if not parts:
         raise _all_failed(failures)
-    return JoinedSource(parts, (*warnings, *(
-        Notice('E-FILE-SKIPPED', f'one of the files is skipped: {each}')
-        for each in failures.values())))
+    skipped = [Notice('E-FILE-SKIPPED', f'one of the files is skipped: {each}')
+               for each in failures.values()]
+    return JoinedSource(_whole_bags(parts), (*warnings, *skipped))
+
+
+# a file of a recording that is split: all else of their names is the same
+PART_OF_BAG = re.compile(r'(?P<bag>.+)_[0-9]+\.(?:mcap|db3|bag)(?:\.zstd)?')
+
+
+def _whole_bags(sources: Sequence[FrameSource]) -> list[FrameSource]:
+    """Return sources in which files of one recording are one: they may overlap in time."""
+    def recording(source: FrameSource) -> tuple[Path, str, str | None] | None:
+        place = Path(source.name)
+        part = PART_OF_BAG.fullmatch(place.name)
+        return (place.parent, part['bag'], source.topic) if part and place.is_file() else None
+
+    whole: list[FrameSource] = []
+    for bag, group in groupby(sources, recording):
+        parts = list(group)
+        if bag is not None and len(parts) > 1:
+            from dashcalib_ros.input.bag_storage import BagSource
+            bags = [each for each in parts if isinstance(each, BagSource)]
+            parts = [bags[0].with_more(bags[1:])] if len(bags) == len(parts) else parts
+        whole += parts
+    return whole
 
 
 def _all_failed(failures: dict[Path, InputError]) -> InputError:
@@ -442,7 +464,7 @@ class JoinedSource(FrameSource):
         counts = [part.count for part in self._parts]
         lengths = [part.length_ns for part in self._parts]
         super().__init__(
-            f'{first.name} and {len(self._parts) - 1} more',
+            first.name + (f' and {len(self._parts) - 1} more' if len(self._parts) > 1 else ''),
             None if None in counts else sum(filter(None, counts)), first.topic,
             (*warnings, *_together([(part.name, part.warnings) for part in self._parts])))
         self.contradictions = tuple(dict.fromkeys(

@@ -39,6 +39,7 @@ from dashcalib_ros.judge.mount import Speed, mount_of
 from dashcalib_ros.judge.verdict import (
     STEADY,
     Finding,
+    crop_matters,
     judge,
     profile_contrast,
     turn_count,
@@ -237,7 +238,8 @@ def _warnings(found: CalibrationData, solution: Solution) -> tuple[Notice, ...]:
             'E-CAMERA-MOVED',
             f'the camera was moved on the car {found.mount.moved_s - found.start_s:.0f} s into '
             f'the drive: the mounting is that from there on'))
-    if found.stabiliser is not None and STEADY not in found.verdict.cures:
+    if (found.stabiliser is not None and crop_matters(solution)
+            and 'E-PICTURE-MOVES' not in found.verdict.codes):
         warnings.append(Notice(
             'E-PICTURE-SEEMS-TO-MOVE',
             f'the picture seems to move by up to {found.stabiliser.largest_px:.0f} px against the '

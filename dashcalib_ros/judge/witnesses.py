@@ -73,8 +73,14 @@ def compare_sensors(solution: Solution | None, stream: SensorStream | None, star
     if stream is None:
         return SensorComparison(solution)
     stream = stream.since(start_s)
-    if solution is None or stream.empty:
+    if stream.empty:
         return SensorComparison(solution, unused=stream.warnings)
+    if solution is None:
+        unused = [name for kind, name in (('rate', 'gyro'), ('position', 'GPS'))
+                  if kind in stream.kinds]
+        return SensorComparison(unused=(*stream.warnings, *(Notice(
+            'E-SENSOR-NO-TURNS', f'the {name} is not used: no turn could be reconstructed that it '
+            f'could be compared with') for name in unused)))
     scenes = [scene for scene in solution.scenes if scene.turn.of_this_drive]
     gyro = gps = informed = None
     notices: list[Notice | None] = list(stream.warnings)

@@ -68,6 +68,27 @@ def test_two_cameras_are_told(pictures, pattern, rate, other, says):
     assert [each.code for each in found.warnings()] == ['E-TWO-CAMERAS']
 
 
+@pytest.mark.parametrize('pattern', ['B' * 40 + 'A' * 400, 'AB' * 20 + 'A' * 400])
+def test_pictures_that_are_mirrored_before_the_first_turn_are_seen(pictures, pattern):
+    """No image is skipped, and no turn has any of them."""
+    found = detect(frames(pictures[::3], pattern, mirrored, 10.0), Config())
+    first = pattern.index('BA' if pattern[0] == 'B' else 'AB') + 1
+    assert f'image {first} is mirrored' in str(found.other_camera)
+    assert [each.code for each in found.warnings()] == ['E-TWO-CAMERAS']
+
+
+def test_another_view_before_the_first_turn_is_named(pictures):
+    """As where the pictures of two cameras were exchanged; missing images have a gap in time."""
+    ten = frames(pictures[::3], rate=10.0)
+    shown = [Frame(n, frame.stamp_ns, ten[-1 - n].image if n < 20 else frame.image)
+             for n, frame in enumerate(ten)]
+    [warning] = detect(shown, Config()).warnings()
+    assert warning.code == 'E-VIEW-JUMPS' and 'image 20 ' in warning
+    gap = [Frame(n, frame.stamp_ns + 10**9 * (n >= 20), frame.image)
+           for n, frame in enumerate(shown)]
+    assert detect(gap, Config()).warnings() == () == detect(ten, Config()).warnings()
+
+
 def test_they_are_refused(pictures):
     found = detect(frames(pictures, 'AB', zoomed(1.1), 20.0), Config())
     calibration = conclude(None, evidence_of_detection(found), Config())

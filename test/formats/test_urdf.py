@@ -65,6 +65,13 @@ def test_the_static_transform_is_the_same(mount):
     assert [float(given[f'--{axis}']) for axis in 'xyz'] == [0, 0, 1.4]
 
 
+def test_an_unknown_height_is_not_written():
+    text = export(NamedCamera('given', TRUTH, mount=replace(MOUNT, height_m=None)), 'tf')
+    words = shlex.split(text, comments=True)
+    assert words[0] == 'ros2' and '--x' in words and '--z' not in words
+    assert text.startswith('#') and '--z' in text.splitlines()[0]
+
+
 @pytest.mark.parametrize(('path', 'name'), [
     ('front/result.json', 'front'), ('left side/calibration.yaml', 'left_side'),
     ('rear--1.yaml', 'rear__1'), ('calibration/result.json', 'camera')])

@@ -6,9 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from solving import CONFIG, scenes_of, solved
-from synthetic import rotation
+from synthetic import SIZE, rotation
 
+from dashcalib_ros.input.scale import FULL_SIZE
+from dashcalib_ros.judge.conclude import Evidence, conclude
 from dashcalib_ros.judge.verdict import judge
+from dashcalib_ros.solve import start
 from dashcalib_ros.solve.solution import Solution
 
 CODE = 'E-TURNED-PICTURES'
@@ -87,3 +90,43 @@ def test_pixels_are_those_of_the_input(solution):
     verdict = judge(replace(solution, around=far, px=0.25), CONFIG.verdict)
     reason = verdict.reasons[verdict.codes.index('E-TWO-FOCAL-LENGTHS')]
     assert f'{0.25 * solution.camera.fx:.0f} px and about' in reason
+
+
+MOVES, TIMES = 'E-PICTURE-MOVES', 'E-TIMES-ASSUMED'
+
+
+def with_times(solution: Solution, late_s: float) -> Solution:
+    """Return the solution with stamps that are late, every second one."""
+    def scene_of(scene):
+        late = round(1e9 * late_s) * (np.arange(len(scene.tracks.frames)) % 2)
+        return replace(scene, tracks=replace(scene.tracks,
+                                             stamps_ns=scene.tracks.stamps_ns + late))
+    return replace(solution, scenes=tuple(map(scene_of, solution.scenes)))
+
+
+def test_uneven_times_that_are_taken_as_even_ones_are_named(monkeypatch):
+    """With a rolling shutter they look as a stabiliser does, with a global one as nothing."""
+    monkeypatch.setattr(start, 'PROBES', (1.0,))
+    dense = {'keyframes': 24, 'keyframe_s': 0.15, 'noise_px': 0.1, 'tracks': 120}
+    found = solved(scenes_of(2, readout_s=0.03, uneven=0.48, **dense))
+    codes = judge(found, CONFIG.verdict).codes
+    assert codes[0] == MOVES and TIMES in codes
+    assert 'times.txt' in judge(found, CONFIG.verdict).cures[codes.index(TIMES)]
+    # true times are no even ones
+    codes = judge(with_times(found, 0.002), CONFIG.verdict).codes
+    assert codes[0] == MOVES and TIMES not in codes
+    fixed = solved(scenes_of(2, uneven=0.48, **dense))
+    assert not fixed.rolling and judge(fixed, CONFIG.verdict).level == 'accepted'
+
+
+def test_only_a_crop_that_matters_is_named(solution):
+    """A slow shift that the turns do not exclude is in sigma."""
+    def moving(px: float) -> tuple[str, ...]:
+        path = px * np.sin(np.linspace(0, 6, 14))[:, None] * (1.0, 0.0)
+        found = conclude(
+            replace(solution, crops={scene.turn: path for scene in solution.scenes}),
+            Evidence(SIZE, 100, (), {}, np.zeros((0, 2)), None, FULL_SIZE, {}), CONFIG)
+        return (*found.verdict.codes, *(each.code for each in found.warnings))
+    # of a width of 800 px; sigma over the picture is less than both
+    assert solution.picture.rms < 1.0
+    assert moving(2.5) == () and moving(8.0) == (MOVES,)

@@ -207,6 +207,18 @@ def gps(drive, stream, solution=None):
 
 
 
+def test_sensors_of_a_drive_without_a_solution_are_named(drive):
+    both = dataclasses.replace(gyro(drive), position=fixes(drive, 0.02).position)
+    lines = compare_sensors(None, both, START_S, CONFIG).unused
+    assert [line.code for line in lines] == ['E-SENSOR-NO-TURNS'] * 2
+    assert 'gyro' in lines[0] and 'GPS' in lines[1]
+
+
+def test_gps_that_is_an_hour_off_is_named_with_the_hour(drive):
+    _, [line] = gps(drive, fixes(drive, 0.02).shifted(3600.0))
+    assert line.code == 'E-GPS-NO-SAMPLES' and ' 1 h ' in line
+
+
 def test_gps_headings_say_nothing_where_the_straights_are_short(drive):
     # six metres before and after each turn
     said, [line] = gps(drive, fixes(drive, 0.02))
