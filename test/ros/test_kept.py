@@ -157,6 +157,19 @@ def test_what_no_lens_has_is_set_aside(store, keys, value, sealed):
     assert mine.load() is None
 
 
+@pytest.mark.parametrize(('key', 'value', 'code'), [
+    ('camera_name', 'rear', 'E-KEPT-OF-OTHER-CAMERA'), ('dashcalib', {}, 'E-KEPT-OF-OTHER-TOPIC'),
+    ('dashcalib', None, 'E-CALIBRATION-ASPECT')])
+def test_what_no_lens_has_stays_where_the_file_is_of_others(store, key, value, code):
+    mine = store(dataclasses.replace(FRONT, plain=False))
+    mine.save(kept_of())
+    edit(mine.path, 'camera_matrix', 'data', 0, value=20.0)
+    edit(mine.path, key, value=value)
+    with pytest.raises(InputError) as raised:
+        mine.load()
+    assert raised.value.code == code and mine.path.exists()
+
+
 def test_what_is_no_file_or_cannot_be_written_is_told_at_once(store, tmp_path):
     os.mkfifo(tmp_path / 'fifo')
     (tmp_path / 'folder').mkdir()
