@@ -28,7 +28,8 @@ from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
 from dashcalib_ros.report import Calibration, NamedCamera, set_aside, write_text
 from dashcalib_ros.whole_files import prepared, remove_leftovers
 
-# camera_info_manager's
+# camera_info_manager's; its Python port is not used, as it reads no file under ROS 2: it sets
+# CameraInfo.K, which is k there (image_common issue 354)
 DEFAULT = 'file://${ROS_HOME}/camera_info/${NAME}.yaml'
 KNOWN = 'file:///folder/camera.yaml, package://package/folder/camera.yaml, or a path'
 # of the width: 170 to 11 degrees across without distortion, or 570 as a fisheye
