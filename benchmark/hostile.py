@@ -1,4 +1,5 @@
 #!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
 """What an attacker, a broken driver or a power cut can do: everything must go on, and be answered.
 
     python benchmark/hostile.py [ATTACK ...] [--quick] [--out DIR] [--results] [--again] [--list]

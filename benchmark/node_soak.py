@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The node for an hour: restarts of the driver, lost images, a camera that is mounted anew.
 
     python benchmark/node_soak.py --minutes 60

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The whole story: frames -> turns -> scenes -> one camera -> verdict."""
 from __future__ import annotations
 

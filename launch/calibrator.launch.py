@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """ros2 launch dashcalib_ros calibrator.launch.py namespace:=front [image_transport:=compressed].
 
 The other launch files include this one, which has the arguments of all.

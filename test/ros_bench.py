@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The tests' side of the wire: the node as a process of its own, and a camera that it hears."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The real node in the tests' own process, between real publishers."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The whole story on a rendered drive: the right lens, the same every time, or a refusal."""
 from __future__ import annotations
 

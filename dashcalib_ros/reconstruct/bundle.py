@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bundle adjustment in NumPy: Levenberg-Marquardt, with points and then poses eliminated (Schur).
 
 Adjusts the poses and points of turns that share one camera, and some of its parameters. The steps

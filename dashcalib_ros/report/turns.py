@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the page shows of each turn: its tracks, a view in space, and its own fx."""
 from __future__ import annotations
 

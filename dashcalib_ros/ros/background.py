@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The background thread: it owns the calibrator, and does what comes into its inbox."""
 from __future__ import annotations
 

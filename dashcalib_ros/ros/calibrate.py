@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The program that calibrates: what is accepted is published beside the images, and kept."""
 from __future__ import annotations
 

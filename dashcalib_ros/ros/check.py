@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The program that checks a driver's calibration with turns, and never changes it."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Images in, turns learned from them, and what these turns say of the camera in use.
 
 Both roles, calibrate.py and check.py, are built on it. Every method and callback runs in the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The node: its parameters, its lifecycle, and what answers where a callback fails."""
 from __future__ import annotations
 

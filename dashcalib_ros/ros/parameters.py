@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The node's parameters: settings of the core by their own names, the node's own, and QoS."""
 from __future__ import annotations
 

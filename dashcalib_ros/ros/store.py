@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The accepted calibration on disk: where, whose, and whether it was edited or cannot be."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How a point becomes a pixel: the lens, the shutter's rows, the field, and what each image has.
 
 These are the blocks of the one problem. Each is a value here, its columns in the linearised

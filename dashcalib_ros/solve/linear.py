@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Residuals -> normal equations of one turn, with its points and poses eliminated (Schur).
 
 The residuals are linearised by the turn's points and poses, by what all turns share (the lens, a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Gauss-Newton steps over all blocks at once, the structures of all turns included.
 
 The tracks stay as they were measured. In each step poses and points are eliminated, the sizes of

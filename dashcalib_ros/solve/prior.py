@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Prior knowledge of a camera, and the bounds of its parameters."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A worker in a child process: COLMAP aborts its process when a check fails.
 
 The parent sends (function, arguments) and receives progress, then a result or an exception, each

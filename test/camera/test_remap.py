@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The rectified picture, and the P of CameraInfo for it, checked by OpenCV's rectification."""
 from __future__ import annotations
 

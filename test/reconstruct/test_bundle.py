@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The adjustment of a turn: to the minimum that SciPy finds, too."""
 from __future__ import annotations
 

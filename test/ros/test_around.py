@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The node among other programs: QoS overrides, lifecycle, missing images, viewers."""
 from __future__ import annotations
 

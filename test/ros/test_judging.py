@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the node does with a calibration: published, kept on disk, replaced, given up, committed.
 
 The real node in this process, between real publishers; only the calibrations are made up here,

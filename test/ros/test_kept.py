@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The file that the node keeps: whose it is, who else has it, and what edits make of it."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The lifecycle in this process: nothing is left behind, whatever the order of transitions."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Overlay and rectified picture: what they show, and that they cost nothing unless watched."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the node says while it learns, one line for each event: no ROS needed."""
 from __future__ import annotations
 
