@@ -1,4 +1,5 @@
 #!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
 """Accuracy, honesty and refusals, measured on rendered drives with exact truth and on real ones.
 
     python benchmark/accuracy.py [SETTING ...] [--seeds 0 1 2] [--data DIR] [--cache DIR]

@@ -1,4 +1,5 @@
 #!/bin/bash
+# SPDX-License-Identifier: Apache-2.0
 # Does the package install on arm64 and calibrate there? In a Debian under emulation, from nothing.
 #
 #     benchmark/arm64.sh [FOLDER]

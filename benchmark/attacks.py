@@ -1,4 +1,5 @@
 #!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
 """Videos that no fixed camera takes, and other bad ones: none may be accepted and wrong.
 
     python benchmark/attacks.py [ATTACK ...] [--films NAME ...] [--seeds 0 1 2] [--data DIR]

@@ -1,4 +1,5 @@
 #!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
 """Whether `dashcalib check` finds what is wrong with a calibration, on rendered drives.
 
     python benchmark/check.py [NAME ...] [--seeds 0 1 2] [--data DIR] [--cache DIR]

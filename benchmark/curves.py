@@ -1,4 +1,5 @@
 #!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
 """The paper's curves: error of each parameter against number of turns and against frame rate.
 
     python benchmark/curves.py [--seeds 0 1 2] [--turns 1 2 3 ...] [--data DIR]

@@ -1,4 +1,5 @@
 #!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
 """Would a sensor find turns that pictures miss, and are they worth anything?
 
     python benchmark/dark.py [--films NAME ...] [--data DIR] [--cache DIR]

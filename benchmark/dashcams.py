@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Random dashcams: lens, shutter, glass, picture and drive of each are drawn from a seed.
 
 A drive is rendered, and its turns are reconstructed: that takes most of the time of a calibration,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The drives that are measured: settings x seeds, rendered once and kept as pictures."""
 from __future__ import annotations
 

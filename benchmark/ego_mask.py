@@ -1,4 +1,5 @@
 #!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
 """The paper's ablation: what leaving the ego vehicle out of the picture is worth.
 
     python benchmark/ego_mask.py [--seeds 0 1 2] [--lenses dashcam wide] [--out DIR]

@@ -1,4 +1,5 @@
 #!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
 """Are the engines that estimate poses equal? Drives calibrated with each, in one table.
 
     python benchmark/engines.py [--data DIR] [--cache DIR] [--workers N]

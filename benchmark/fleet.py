@@ -1,4 +1,5 @@
 #!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
 """What `dashcalib batch` must show; one command for all of it, or for a part.
 
     python benchmark/fleet.py [lost] [clips] [prior] [speed] [real] [--videos N]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Clips for fleet.py: rendered streets, cut and seen through other lenses; and made turns."""
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
 #!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
 """Rendered drives through a windscreen, a poor rectification, a decentred lens; exact truth.
 
     python benchmark/glass.py [PART ...] [--seeds 0 1 2] [--cache DIR] [--out DIR] [--results]

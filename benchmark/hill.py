@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rendered drives on a slope, and on a crowned road."""
 from __future__ import annotations
 

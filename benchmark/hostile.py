@@ -1,4 +1,5 @@
 #!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
 """What an attacker, a broken driver or a power cut can do: everything must go on, and be answered.
 
     python benchmark/hostile.py [ATTACK ...] [--quick] [--out DIR] [--results] [--again] [--list]
@@ -35,7 +36,6 @@ import with_tests  # noqa: F401
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from measure import commit, parser_with, table
-from node_latency import resident_mb
 from processes import processes_of
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import (
@@ -79,12 +79,8 @@ from dashcalib_ros.ros.store import CameraIdentity, Store
 
 KEPT = CAMERA_FILE.format(width=320) + OURS
 FX = 200.0
-# s of the soak; quick
-SOAK_S, SHORT_SOAK_S = 900.0, 60.0
 # s; what takes longer waited for a picture: machines are slow
 SLOW_S = 15.0
-# the memory of a soak's end, of that after its first quarter
-FLAT = 1.1
 
 
 @dataclass(frozen=True)
@@ -330,50 +326,6 @@ def frames(_: Path, tries: Sequence[int]) -> Iterator[None]:
             yield
         else:
             raise AssertionError(f'a stamp of {stamp} is taken')
-
-
-def soak(seconds: float, folder: Path) -> None:
-    """A looped drive with its true calibration, images lost: flat memory, and no false alarm."""
-    lens = Lens.of(640, 360, 75.0, -0.30, 0.10, offset=(9.0, -6.0), aspect=1.003)
-    pictures = [frame.image for frame in Drive(lens, DriveSpec(seed=0, turns=2)).frames()]
-    text = (KEPT.replace('width: 320', 'width: 640').replace('height: 240', 'height: 360')
-            .replace('200.0, 0.0, 160.0, 0.0, 201.0, 120.0',
-                     f'{lens.fx}, 0.0, {lens.cx}, 0.0, {lens.fy}, {lens.cy}')
-            .replace('-0.1, 0.01', f'{lens.k1}, {lens.k2}'))
-    rng = np.random.default_rng(0)
-    memory: list[float] = []
-    with running(folder, kept=text) as (node, camera):
-        started = looked = time.monotonic()
-        silent_until = n = 0
-        while (passed := time.monotonic() - started) < seconds:
-            n += 1
-            # thrice as fast as it was driven
-            camera.spin(max(0.0, n / 30 - passed))
-            if rng.random() < 0.01:
-                silent_until = n + int(rng.integers(3, 30))
-            if n > silent_until and rng.random() > 0.3:
-                camera.images.publish(image_message(pictures[n % len(pictures)],
-                                                    START + n * SECOND // 10))
-            if time.monotonic() > looked + 1:
-                looked = time.monotonic()
-                memory.append(resident_mb(node.process.pid))
-        camera.spin(2.0)
-        values = camera.values
-        quarter = len(memory) // 4
-        before, after = (float(np.median(memory[part])) for part in (
-            slice(quarter, 2 * quarter), slice(-quarter, None)))
-        print(f'soak: {values["received"]} images, {values["lost"]} lost, {before:.0f} to '
-              f'{after:.0f} MB, change {values["change"]!r}, contradictions '
-              f'{values["contradictions"]}', flush=True)
-        assert after <= FLAT * before, f'memory grew from {before:.0f} to {after:.0f} MB'
-        assert not values['change'], values['change']
-        assert 'Traceback' not in node.text
-
-
-def soaks(folder: Path, tries: Sequence[int]) -> Iterator[None]:
-    for n in tries:
-        soak(SOAK_S if n else SHORT_SOAK_S, folder / str(n))
-        yield
 
 
 # files and fleets ----------------------------------------------------------------------------
@@ -1147,8 +1099,7 @@ ATTACKS = [
     Attack('odd parameters at the start', 120, 8, odd_parameters),
     Attack('small files that become large', 16, 16, bombs),
     Attack('numbers that no lens has', 18, 3, numbers),
-    Attack('names that act', 8, 8, forged_texts),
-    Attack('soak with lost images', 2, 1, soaks)]
+    Attack('names that act', 8, 8, forged_texts)]
 
 
 def tried(attack: Attack, lacking: Sequence[int]) -> Iterator[tuple[int, str]]:

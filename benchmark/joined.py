@@ -1,4 +1,5 @@
 #!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
 """A drive cut into five files: how far its calibration is from that of the whole, in sigmas.
 
     python benchmark/joined.py [--drives kitti03 NAME ...] [--data DIR] [--cache DIR]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Straight lines as a second witness: rendered drives with exact truth, and a real drive.
 
     python benchmark/lines.py --seeds 0 1 --cache /tmp/cache --data ../shared/data

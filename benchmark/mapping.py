@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The mapping error: by how many pixels an estimate is off all over the picture, in any model.
 
 Written without the calibration's own camera models, so that it cannot share an error with them.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What every benchmark here needs: errors, a process of its own for each measurement, files."""
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
 #!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
 """After how many turns the monitor notices a change of the camera, and how often for nothing.
 
     python benchmark/monitor.py --cache DIR [--drives N] [--seed N] [--out DIR]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a gyro and GPS say of fx: rendered drives, and real ones with poses or sensors.
 
     python benchmark/motion.py --data data --single 20

@@ -1,4 +1,5 @@
 #!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
 """How the camera sits on the car: what is found beside the truth.
 
     python benchmark/mount.py [--data DIR] [--cache DIR] [--seeds N ...] [--out DIR] [--results]

@@ -1,4 +1,5 @@
 #!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
 """A camera that is moved on the car within a drive: how often it is told, and told for nothing.
 
     python benchmark/moved.py [--drives 100] [--degrees 1.0] [--metres 200]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A drive at its own rate through DDS into the node: how soon, how right, and nothing before.
 
     python benchmark/node_drive.py                     the demo's drive, exact truth

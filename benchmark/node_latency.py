@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The node under load: image callback latency, losses, CPU and memory, while it calibrates.
 
     python benchmark/node_latency.py --minutes 10 [--preview]

@@ -1,4 +1,5 @@
 #!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
 """Draw the pictures of README.md and docs/ from the demo drive.
 
     python benchmark/pictures.py [--only plots|report]

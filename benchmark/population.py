@@ -1,4 +1,5 @@
 #!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
 """Random dashcams: lens, shutter, glass, picture and drive of each are drawn from a seed.
 
     python benchmark/population.py --seeds 1000-1059 --out DIR [--workers N]

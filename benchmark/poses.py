@@ -1,4 +1,5 @@
 #!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
 """The true motion of a drive beside what cameras find: over its turns, and over all of it.
 
     python benchmark/poses.py DRIVE POSES --camera NAME=FILE ... [--out DIR]

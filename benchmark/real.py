@@ -1,4 +1,5 @@
 #!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
 """Real drives: does the sigma hold for each choice of turns, and do rotations agree with fx?
 
     python benchmark/real.py --data DIR [--seeds N ...] [--out DIR] [--results]

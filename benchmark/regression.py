@@ -1,4 +1,5 @@
 #!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
 """Do two versions of the code give the same numbers? Six drives, bit for bit.
 
     python benchmark/regression.py --data DIR [--cache DIR] [--against FILE] --out FILE

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tables of benchmark/results/: the benchmark that measures one writes it between two markers."""
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
 #!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
 """dashcalib beside COLMAP's defaults and a trivial guess, on the same frames in the same run.
 
     python benchmark/rivals.py [SETTING ...] [--rivals NAME ...] [--seeds 0] [--turns 5]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What takes the room of an environment: the size of each installed package, and what needs it.
 
 Run it with the Python of an environment that has only this package:

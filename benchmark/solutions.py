@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Solved drives on disk: what is measured of a solution needs no second rendering or solving."""
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
 #!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
 """Where time goes, on this machine; in units of a fixed piece of work it compares with others.
 
     python benchmark/speed.py [command] [calibration] [length] [turns] [detection] [hour]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rows of accuracy.json -> medians beside the bars, honesty, false accepts and refusals."""
 from __future__ import annotations
 

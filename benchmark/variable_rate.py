@@ -1,4 +1,5 @@
 #!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
 """Videos of a variable rate: the readout that is found, and the times of the turns.
 
     python benchmark/variable_rate.py [--readouts 10 20 30] [--out DIR]

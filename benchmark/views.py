@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A drive as another camera in its place would have seen it: its pictures, another known lens.
 
 The pictures are resampled for another lens, mirrored, cropped, shrunk, darkened or cut in time. A

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rendered drives through fisheye lenses: what no pinhole camera sees, with exact truth."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Importing this makes the helpers of the tests (ros_bench, fleet_made and others) importable."""
 import sys
 from pathlib import Path

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Calibrates a dashcam online, from the turns that the car takes."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The kinds of arrays that the rooms exchange, and values as plain types."""
 from __future__ import annotations
 

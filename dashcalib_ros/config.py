@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The one home of every default, each with the reason for its value.
 
 Users set about fifteen of them, setting(); the others are for experts, expert(). The measurements

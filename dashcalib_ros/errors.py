@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """All errors that a user can cause. The core raises them; only the borders (cli, ros) catch them.
 
 Each has a code and one line of text with the problem and its cure, and so have warnings.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Limits for all files and messages from outside: sizes, depths and numbers of values.
 
 All code that reads such input checks it here first. Input beyond a limit raises InputError before

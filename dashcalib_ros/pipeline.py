@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The whole story: frames -> turns -> scenes -> one camera -> verdict."""
 from __future__ import annotations
 
@@ -35,6 +36,7 @@ from dashcalib_ros.judge.witnesses import SensorComparison, compare_sensors
 from dashcalib_ros.reconstruct.repeated import without_repeated
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.report import Calibration
+from dashcalib_ros.report.turns import direction
 from dashcalib_ros.selection import SceneSelection
 from dashcalib_ros.solve import solve
 from dashcalib_ros.solve.solution import Solution
@@ -50,8 +52,9 @@ class Status:
     frames: pushed so far. turns: in the bank and stored. built: how many scenes a calibration
     would use now; ready: their turns; yaw_deg: the sum of their yaw. stored: how many turns are of
     earlier drives. magnitude: the newest filtered turning magnitude, of the image width.
-    yaws_deg: of the turns in ready, in their order. reconstructed: the turns that watch() has
-    scenes of, chosen or not. two_cameras: what the newest images show, if they are of two.
+    yaws_deg: of the turns in ready, in their order; ways: where these go, as direction() says.
+    reconstructed: the turns that watch() has scenes of, chosen or not. two_cameras: what the
+    newest images show, if they are of two.
     """
 
     frames: int
@@ -65,6 +68,7 @@ class Status:
     yaws_deg: tuple[float, ...] = ()
     reconstructed: tuple[TurnId, ...] = ()
     two_cameras: str = ''
+    ways: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -363,7 +367,8 @@ class Calibrator:
                       found.standing, tuple(scene.turn for scene in chosen), stored,
                       tuple(scene.yaw_deg for scene in chosen),
                       tuple(self.scenes.all_scenes()),
-                      str(found.other_camera) if found.mixed else '')
+                      str(found.other_camera) if found.mixed else '',
+                      tuple(map(direction, chosen)))
 
     def __enter__(self) -> Calibrator:
         return self

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Statistics that a few bad values do not spoil, and lists that stay short.
 
 Least squares with Cauchy's weights: an error counts by 1 / (1 + (error / scale)^2), so that wrong

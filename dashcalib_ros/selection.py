@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which turns are reconstructed, and which scenes a calibration uses."""
 from __future__ import annotations
 

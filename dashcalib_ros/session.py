@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A recorded drive in, a result out: the one wiring of the command, Python and the fleet."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """stdin, stdout and stderr, which may be closed, full, or without a reader.
 
 What other people named and wrote is in our lines: its control characters are written out here.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Files that are whole or absent, whenever a process or the power ends.
 
 What is not whole yet has a temporary name and is locked: nothing locks it any more once its

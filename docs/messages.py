@@ -1,4 +1,5 @@
 #!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
 """Write docs/messages.md, the table of all messages with a code: python docs/messages.py.
 
 The messages are read from the source, which is not run: every call with a literal code ('E-...')

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Hooks of mkdocs.yml: the site has the repository's tree, so that every link is right in both."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Plays a recorded drive to the node, as a camera driver does: ROS 2 from pip has no ros2 bag.
 
     python examples/play.py drive.mp4 --to /front/image_raw

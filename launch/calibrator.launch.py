@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """ros2 launch dashcalib_ros calibrator.launch.py namespace:=front [image_transport:=compressed].
 
 The other launch files include this one, which has the arguments of all.
@@ -32,11 +33,11 @@ ARGUMENTS = (
                                      'calibrator.yaml']), 'the parameter file'),
     ('autostart', 'true', 'false: the node waits until its state is changed'),
     ('manage', 'false', 'true, with autostart:=false: this launch changes the state'),
-    ('rviz', 'false', 'true starts RViz with the images, the overlay and the rectified picture'),
+    ('rviz', 'false', 'true starts RViz with the images, what the node draws, and the mounting'),
 )
 RVIZ = PathJoinSubstitution([FindPackageShare('dashcalib_ros'), 'config', 'dashcalib.rviz'])
 # topics in RVIZ that are in the namespace
-PICTURES = ('calibrator/overlay/compressed', 'calibrator/rectified/compressed')
+SHOWN = ('calibrator/overlay/compressed', 'calibrator/rectified/compressed', 'calibrator/mount')
 
 
 def started(context):
@@ -78,5 +79,5 @@ def generate_launch_description():
             package='rviz2', executable='rviz2', name='rviz', namespace=value['namespace'],
             arguments=['-d', RVIZ], condition=IfCondition(value['rviz']),
             remappings=[('/image_raw', value['image']),
-                        *((f'/{topic}', topic) for topic in PICTURES)]),
+                        *((f'/{topic}', topic) for topic in SHOWN)]),
     ])

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """ros2 launch dashcalib_ros calibrator_lifecycle.launch.py [namespace:=front] ...
 
 The node waits for a lifecycle manager. With manage:=true this launch is one: it configures and

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One calibrator for each camera of a car.
 
 ros2 launch dashcalib_ros cameras.launch.py \

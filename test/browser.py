@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pages in a real browser, where there is one: what is cut, over other text, or fails."""
 from __future__ import annotations
 

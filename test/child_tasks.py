@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the tests have done in a child process; it must be importable there by name."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What holds for all tests; fixtures of those that talk to the node, which import rclpy late."""
 import os
 import signal

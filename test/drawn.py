@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A calibration with all that the report draws: made scenes, solved, and pictures of noise."""
 from __future__ import annotations
 

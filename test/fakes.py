@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fakes whose calls are checked against what they stand for: a changed signature fails here."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fleets without pictures: clips that are gathered turns with exact truth."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tasks for workers of other processes."""
 from __future__ import annotations
 

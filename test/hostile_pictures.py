@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Small picture files that take long to decode, where nobody counts what is in them."""
 from __future__ import annotations
 

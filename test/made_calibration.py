@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A small but complete calibration, made by hand."""
 from __future__ import annotations
 

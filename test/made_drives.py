@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Drives of every kind, written for the tests of what reads them."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A video file of a GoPro with nothing but its motion data: GPMF in a metadata track of an MP4."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Upright lines as a camera sees them, whose truth is known."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A drive through a town on paper: what a gyro and GPS see of it."""
 from __future__ import annotations
 

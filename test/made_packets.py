@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The packets of a video, as publishers of messages make them."""
 from __future__ import annotations
 

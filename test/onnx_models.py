@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Small segmentation models, made by the tests themselves."""
 from __future__ import annotations
 

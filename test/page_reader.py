@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Reads report.html as a test sees it."""
 from __future__ import annotations
 

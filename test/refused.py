@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How tests check an error: by its class, its code, and the values in its text."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The tests' side of the wire: the node as a process of its own, and a camera that it hears."""
 from __future__ import annotations
 
@@ -45,10 +46,14 @@ sys.exit(main(sys.argv[1] if named else 'calibrator', sys.argv[1 + named:]))
 """]
 
 
-# for a driver's process: Fast DDS's name of the variable, and that of Kilted's
-LARGE_IMAGES = dict.fromkeys(
-    ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE'),
-    str(REPOSITORY / 'config' / 'fastdds_large_images.xml'))
+def profiles(path):
+    """Return what lets Fast DDS read a file, by its name for the variable and by Kilted's."""
+    return dict.fromkeys(
+        ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE'), str(path))
+
+
+# for a driver's process
+LARGE_IMAGES = profiles(REPOSITORY / 'config' / 'fastdds_large_images.xml')
 
 
 def ros_environment(home):
@@ -56,6 +61,7 @@ def ros_environment(home):
     return {
         'ROS_DOMAIN_ID': str(DOMAIN), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
         'ROS_PYTHON_CHECK_FIELDS': '1', 'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4',
+        **profiles(REPOSITORY / 'test' / 'fastdds_one_process.xml'),
         'HOME': str(home), 'ROS_LOG_DIR': str(Path(home) / 'log'),
         'PYTHONPATH': os.pathsep.join([str(REPOSITORY), os.environ.get('PYTHONPATH', '')])}
 
@@ -160,15 +166,16 @@ class Bench:
         while time.monotonic() < end:
             self.executor.spin_once(timeout_sec=0.02)
 
-    def connect(self, node):
-        """Wait until the node hears the images, as reliably as they come, and is heard."""
-        def heard():
-            others = self.node.get_subscriptions_info_by_topic(self.images.topic_name)
-            return (self.images.get_subscription_count() == len(others) > 0
-                    and all(each.qos_profile.reliability == self.kind for each in others)
-                    and self.values.get('reliability') == self.reliability)
+    def heard(self):
+        """Return whether the node hears the images, as reliably as they come, and is heard."""
+        others = self.node.get_subscriptions_info_by_topic(self.images.topic_name)
+        return (self.images.get_subscription_count() == len(others) > 0
+                and all(each.qos_profile.reliability == self.kind for each in others)
+                and self.values.get('reliability') == self.reliability)
 
-        self.until(heard, what='the connection', node=node)
+    def connect(self, node):
+        """Wait until the node hears the images, and is heard."""
+        self.until(self.heard, what='the connection', node=node)
         # the other side matches a moment later
         self.spin(0.2)
 

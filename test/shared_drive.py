@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A drive with two turns, of which the truth is known, rendered once for all tests of a run."""
 from __future__ import annotations
 

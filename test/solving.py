@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Made scenes, solved."""
 from __future__ import annotations
 

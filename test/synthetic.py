@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Turns with exact truth but without pictures: what tests of the geometry are made of."""
 from __future__ import annotations
 

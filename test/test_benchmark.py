@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The benchmarks start, and their tables have a place."""
 from __future__ import annotations
 

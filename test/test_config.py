@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Settings: valid defaults with reasons, and one clear line for every value that does not fit."""
 from __future__ import annotations
 

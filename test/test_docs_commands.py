@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every command and every piece of Python in the documents is run here, on small inputs.
 
 What cannot be run on any machine that tests this stands in CANNOT_RUN, with the reason.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The example notebook, run from its first cell to its last."""
 from __future__ import annotations
 

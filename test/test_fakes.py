@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A fake that is not called like the real thing is found out."""
 import pytest
 from fakes import called_like, compressed_message, image_message, stands_in_for

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What comes in from outside has one budget: odd files, bottomless texts, bombs."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every error and every warning has a code, and docs/messages.md lists all of them."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the source distribution and the wheel hold, and the Dockerfile takes."""
 from __future__ import annotations
 

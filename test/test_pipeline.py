@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The whole story on a rendered drive: the right lens, the same every time, or a refusal."""
 from __future__ import annotations
 
@@ -37,6 +38,7 @@ from dashcalib_ros.pipeline import Calibrator
 from dashcalib_ros.reconstruct import reconstruct
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.report import Calibration
+from dashcalib_ros.report.turns import LEFT
 from dashcalib_ros.selection import SceneSelection
 from dashcalib_ros.session import calibrate
 from dashcalib_ros.solve import solve
@@ -204,6 +206,7 @@ def test_a_live_calibrator_gives_the_same_even_if_asked_on_the_way_with_a_turn_l
         assert calibrator.status().built == 1
         assert calibrator.status().reconstructed == calibrator.status().ready
         assert calibrator.status().yaw_deg == pytest.approx(85.0, abs=8.0)
+        assert calibrator.status().ways == (LEFT,)
         for frame in frames[ONE_TURN:]:
             calibrator.push(frame)
             # whatever waits, waits in the pool, whose queue has an end

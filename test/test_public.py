@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What `from dashcalib_ros import ...` gives, and that its help needs no other help."""
 from __future__ import annotations
 

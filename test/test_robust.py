@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The statistics that all rooms share: few bad values do not spoil them."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The rooms: who may import whom, and what must not be loaded before it is needed."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Command and Python are one wiring: the same drive gives the same numbers in both."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The stages as functions, and what it takes to add a camera model."""
 from __future__ import annotations
 

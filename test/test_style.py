@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The linters are part of the tests: what they find fails here too."""
 import importlib.util
 import subprocess
@@ -8,10 +9,23 @@ import numpy as np
 import pytest
 
 ROOT = Path(__file__).parent.parent
+LICENCE = 'SPDX-License-Identifier: Apache-2.0'
 # each has other types of arrays, and what one takes another may not: newest of Python 3.11, 3.12
 CHECKED_WITH = ('2.4', '2.5')
 # the source distribution has no benchmarks
 MYPY = ['mypy'] if (ROOT / 'benchmark').is_dir() else ['mypy', 'dashcalib_ros']
+
+
+def test_every_source_file_names_its_licence():
+    sources = [ROOT / 'setup.py', *(
+        path for folder in ('dashcalib_ros', 'test', 'benchmark', 'docs', 'examples', 'launch',
+                            'scripts', 'config')
+        for path in (ROOT / folder).rglob('*')
+        if path.suffix in ('.py', '.sh', '.xml', '.rviz') or path.parent == ROOT / 'scripts')]
+    assert len(sources) > 100
+    lacking = [str(path.relative_to(ROOT)) for path in sources if path.is_file()
+               and LICENCE not in '\n'.join(path.read_text().splitlines()[:2])]
+    assert lacking == [], f'begin with: # {LICENCE}'
 
 
 @pytest.mark.parametrize('command', [['ruff', 'check', '.'], MYPY])

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What is half-written when a process is killed: the next one removes it, and nothing else."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Waiting in tests: for a condition, and for what runs in a thread meanwhile."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The camera models: projection, viewing rays, derivatives, limits; COLMAP's names and ROS's."""
 from dashcalib_ros.camera.camera import FISHEYE, PINHOLE, Camera
 from dashcalib_ros.camera.camera_info import ros_camera, ros_faults

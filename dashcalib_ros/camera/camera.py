@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What every camera model has: parameters, projection, viewing rays, derivatives, limits.
 
 A model is a frozen dataclass that adds its distortion coefficients to fx, fy, cx, cy, and one row

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A camera as ROS has it: the fields of CameraInfo, and what may be wrong with them."""
 from __future__ import annotations
 

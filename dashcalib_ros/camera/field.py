@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The smooth displacements over the picture that no lens model has.
 
 A windscreen bends the picture, and so does an imperfect rectification, by 0.2 to 2 px. Products of

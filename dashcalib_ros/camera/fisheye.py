@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fisheye lenses: the angle off the axis, not its tangent, grows with the radius in the picture.
 
 With theta the angle between a ray and the optical axis, the radius is fx times

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Cameras compared by what they do: where in the picture they see the same viewing rays.
 
 Parameters of a camera, and all the more of two models, may differ much and map rays alike. What

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The table of camera models. A new model is a class in the file of its family and a row here."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pinhole lenses: the paper's two radial terms, Brown's five, OpenCV's quotient of polynomials.
 
 With x, y the point over its depth and s = x^2 + y^2, the pixel is K times

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The rectified picture, without distortion: what it shows, and where each of its pixels is seen.
 
 It is a plane, and no plane shows a ray at 90 degrees: near there it is stretched without limit.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rotation vectors and matrices, by OpenCV: SciPy's take 0.2 s to load, in every process."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The arguments and the exit codes of every command."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """dashcalib batch: a fleet's clips -> a calibration for each camera, and tables of all."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """dashcalib compare and export: calibrations of files, without a drive."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """dashcalib check: whether a calibration explains a drive."""
 from __future__ import annotations
 

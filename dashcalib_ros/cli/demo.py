@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """dashcalib demo: a rendered drive, calibrated and compared with the truth."""
 from __future__ import annotations
 

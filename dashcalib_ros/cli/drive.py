@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From a command's arguments to its settings and its drive."""
 from __future__ import annotations
 

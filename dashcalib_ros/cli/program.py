@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """main: from arguments to an exit code; here known errors become one line on stderr."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """dashcalib run, and turns: what a run would use, without calibrating."""
 from __future__ import annotations
 

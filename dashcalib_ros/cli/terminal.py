@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """stdout for results, stderr for progress, warnings and errors; plain text in a pipe.
 
 No colours are used if NO_COLOR is set.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rendered drives with exact truth: the embedded default input, and the tests' fixture."""
 from dashcalib_ros.demo.demos import DEMOS, demo_drive
 from dashcalib_ros.demo.drive import Drive, render, render_to_bag

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """All textures, each with its mip levels, in one picture that cv2.remap can sample at once."""
 from __future__ import annotations
 

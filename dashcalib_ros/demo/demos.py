@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The drives of `dashcalib demo`: one for each kind of lens, and for what spoils a calibration."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A drive through the town: frames by random access, and the truth about them."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rendered fisheye lenses: what no pinhole camera sees, with exact truth.
 
 The lens is equidistant with four terms, as in OpenCV's fisheye module and in ROS: a ray at angle t

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What stands before a rendered lens: a windscreen, or what a rectification left over."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The ground's one big picture: asphalt, pavements, markings, cracks, shadows."""
 from __future__ import annotations
 

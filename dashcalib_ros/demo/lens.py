@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The rendered camera: a pinhole with distortion, and what stands in front of it; all exact."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a dashcam sees of its own car, and burns into the picture."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Textures: façades, cars, leaves, sky. All (h, w) uint8, different for every seed."""
 from __future__ import annotations
 

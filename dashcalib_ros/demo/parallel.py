@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Frames from several processes, in order, and with a bounded number in flight."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where the rear axle goes: straights and turns joined by clothoids."""
 from __future__ import annotations
 

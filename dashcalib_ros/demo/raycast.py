@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Textured rectangles -> picture, by casting the exact ray of every distorted pixel.
 
 A rectangle's plane makes inverse depth w, and its texture coordinates times w, linear in the ray

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What kind of drive to render."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The town: streets along the path, houses, parked cars, trees, signs, ground and sky."""
 from __future__ import annotations
 

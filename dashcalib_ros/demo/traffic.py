@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Cars that move: oncoming, leading and crossing."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How the car, and the camera in it, move along the path: speed, pitch, roll and bounce."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Frames -> tracks -> epipoles -> turning magnitudes -> peaks -> the bank of the best turns.
 
 Also the ego-vehicle mask, and upright lines of the world, which are a witness of the lens.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The bank: the most prominent turns with their images, bounded however long the drive is."""
 from __future__ import annotations
 

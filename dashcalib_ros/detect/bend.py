@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How a camera bends the upright lines of the world: lines + camera -> Bend.
 
 A straight line in the world and the camera's centre lie in a plane. Its picture is known when the

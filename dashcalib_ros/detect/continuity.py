@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whether an image follows the one before without a loss: by the motion of the points.
 
 From one image to the next the speed of the car hardly changes; what changes quickly are the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Turning magnitudes -> turns, while the car drives (paper, algorithm 1)."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A picture -> the smooth upright edges in it, as a few points each; those of a whole drive.
 
 Only edges within 45 degrees of the picture's columns are looked for: poles, the edges of houses,

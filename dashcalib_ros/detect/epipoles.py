@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The epipoles of a pair of images, and the turning magnitude from them (paper, 3.1).
 
 The paper takes the epipoles' mean distance from the image centre. That distance depends mostly on

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Images -> tracked points -> epipoles -> turning magnitude, at a constant cost per image."""
 from __future__ import annotations
 

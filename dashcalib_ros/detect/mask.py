@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The mask of the ego vehicle: what moves with the camera does not move in the picture.
 
 It replaces the paper's segmentation network by evidence from the drive. Image gradients are summed

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whether all images of a stream are of one camera: some of the skipped ones are compared.
 
 Images that come faster than motion.rate are skipped, and all images used may be of one camera

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The turning magnitude as a signal, in streams: its median, its peaks, their prominence."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Corner points: found in an image, and tracked from image to image."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The mask of the ego vehicle from the user's segmentation network, as in the paper.
 
 The network segments a few images of the drive; pixels that are vehicle in at least half of them

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pairs of images of a car that drives straight on: they show where the camera points."""
 from __future__ import annotations
 

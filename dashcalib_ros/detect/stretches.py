@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The stretches of a drive beside its turns that promise most about the camera.
 
 What shows a focal length is rotation that points see while they live, about any axis: a bend, a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A turn, or another stretch of the drive that the calibration uses."""
 from __future__ import annotations
 

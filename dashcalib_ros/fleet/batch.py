@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A fleet, from its manifest to its tables: the whole story.
 
 Each clip is gathered, each camera solved as soon as its clips are, the prior of each model of

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A clip -> the scenes of its turns, and what became of it. Done is what has a file.
 
 Each task is a function of its arguments and of files; it may run anywhere, and twice.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where tasks run: in child processes of this machine, or on the workers of a Ray cluster.
 
 A task that ends its worker (COLMAP aborts, the system is out of memory) is tried again, up to

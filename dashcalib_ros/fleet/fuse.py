@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """All clips of one camera -> its own result.
 
 A clip that shows another camera (another device, a zoom, another mode of the sensor) is named and

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What units of one model have in common: a normal distribution of their lenses, from the fleet.
 
 The units of a model, which is called its make here, have nearly the same focal length and

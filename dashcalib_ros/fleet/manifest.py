@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which clips there are: a table, a folder or a glob -> rows."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """overview.html: the fleet on one page, with links to each camera's report."""
 from __future__ import annotations
 

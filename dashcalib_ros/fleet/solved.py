@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A camera's own result, as a JSON text; with the prior of its model, the final calibration."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Files here and on object stores, read and written whole: paths, and URLs such as s3://.
 
 Only URLs need fsspec. A manifest may be a stranger's: of the many things that fsspec opens, only

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The fleet's tables: a row a camera, a row a clip; the same results give the same bytes.
 
 Parquet with pyarrow, without it JSON Lines, and CSV; DuckDB reads all.

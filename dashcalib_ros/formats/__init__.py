@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Files that describe a camera, ours and other programs': a module for each, and their table."""
 from dashcalib_ros.formats.export import export
 from dashcalib_ros.formats.load import Given, given_camera, load_camera

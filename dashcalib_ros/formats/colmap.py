@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """COLMAP's cameras.txt and cameras.bin. It counts pixels from the first one's corner."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A camera as the file of another program, of its pictures or of resized or cropped ones."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Foxglove's CameraCalibration as JSON; it is read as any file with a camera matrix."""
 from __future__ import annotations
 

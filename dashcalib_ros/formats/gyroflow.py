@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Gyroflow's lens profile. Without coefficients each of its models is a pinhole."""
 from __future__ import annotations
 

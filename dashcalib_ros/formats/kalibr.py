@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Kalibr's camchain.yaml."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Reads a camera from a calibration of any common kind: load_camera().
 
 Where a file has several cameras, the caller names one.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """mrcal's .cameramodel, a Python literal."""
 from __future__ import annotations
 

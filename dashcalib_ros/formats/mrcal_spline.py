@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A camera and its field as mrcal's splined stereographic lens, the one of mrcal's that has both.
 
 mrcal sees a ray at q = f (u + s(u)) + c, where u is the ray's stereographic projection, and s a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """nerfstudio's transforms.json. It counts pixels from the first one's corner."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """OpenCV's camera matrix and distortion coefficients, as ROS and many scripts write them, too.
 
 Read from YAML, XML, JSON and .npz; written as cv2.FileStorage does.

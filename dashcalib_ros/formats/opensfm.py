@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """OpenSfM's camera_models.json and reconstruction.json.
 
 It counts from the picture's middle, in units of its longer side.

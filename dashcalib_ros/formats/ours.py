@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Our own files: result.json, strict JSON, and calibration.yaml, ROS's with one extra block.
 
 Both have the same values by the same names. What reads a camera takes what there is, also of older

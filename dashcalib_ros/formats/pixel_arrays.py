@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A value for each pixel as an .npz: viewing rays, and the maps of cv2.remap.
 
 Beside them it has the camera's K and D, by which it is read like any file with a camera matrix.

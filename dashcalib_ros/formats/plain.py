@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Focal lengths and centre by name (fx, fy, cx, cy), with coefficients by name or as a list.
 
 They stand by themselves, or are an object in the file: one of several cameras, or of what other

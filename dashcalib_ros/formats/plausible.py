@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whether a camera that was read can be one: the same checks for all formats.
 
 What no camera has is an InputError; what few have is a warning. The units come first, then the

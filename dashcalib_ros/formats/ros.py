@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """ROS's camera_info: the YAML and INI files of camera_calibration_parsers, and messages.
 
 The YAML is what camera_info_manager, usb_cam, v4l2_camera and others load. Keys, order and layout

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The table of formats: how each is recognised, read and written.
 
 A new format is a module and a row here. A reader returns the cameras that a content has, by name;

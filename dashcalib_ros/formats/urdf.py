@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How the camera sits on the car: as URDF, and as a static transform. Neither is read."""
 from __future__ import annotations
 

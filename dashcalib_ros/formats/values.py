@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The values of a camera file, checked; and the camera that they describe.
 
 A file's lens must be one of the models in camera/ exactly: what they lack (skew, thin prisms,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Images in: bags, videos and folders as iterables of Frame.
 
 Nothing here imports OpenCV or rosbags before a drive is opened: `--help` stays quick.

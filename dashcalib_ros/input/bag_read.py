@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The messages of a bag's file: by its index, or from its start as far as it is whole.
 
 A damaged file is scanned without its index: a scanner yields messages in the order in which they

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A bag as a drive: its files as one sequence of messages, and the images on one topic.
 
 A bag is a list of storage files, each complete in itself: metadata.yaml has only their names, the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A copy of a bag with a camera_info for each image, and the camera_info that a bag has."""
 from __future__ import annotations
 

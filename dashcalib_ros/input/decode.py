@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Image messages and image files -> images of 8 bits, grey or in colour; mask files -> masks.
 
 Works on anything with the fields of sensor_msgs/Image or sensor_msgs/CompressedImage: messages of

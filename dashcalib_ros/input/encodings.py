@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The bytes of a bag's message -> the message, in the shape of ROS's, whatever encoded it.
 
 Foxglove's pictures and calibrations (protobuf, JSON, or messages of foxglove_msgs) become what

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The images of a folder as a drive: their order and their times."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The kinds of inputs: open_frames() finds what its paths are, and joins several.
 
 Nothing here loads OpenCV or rosbags before a drive is opened: `--help` stays quick.

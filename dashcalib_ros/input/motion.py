@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the car knows of its own motion: streams of a gyro, a speed and positions.
 
 A stream's stamps are seconds since the drive's first image, on the sensor's own clock: how far

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Motion streams: from CSV, GPX, KITTI's oxts folders, inside videos, and a bag's own topics."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Messages that are packets of a video (H.264, H.265 and others) -> pictures.
 
 A packet needs those before it, back to a key picture: whoever comes later waits for the next one.

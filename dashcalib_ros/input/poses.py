@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Poses of a vehicle: of GPS/IMU, lidar or SLAM (KITTI, TUM, EuRoC), or of a GPS track."""
 from __future__ import annotations
 

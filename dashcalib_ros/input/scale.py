@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How much larger or smaller pictures are made before anything else sees them."""
 from __future__ import annotations
 

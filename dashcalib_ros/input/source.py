@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What every kind of input has in common: its frames, and how they are read."""
 from __future__ import annotations
 

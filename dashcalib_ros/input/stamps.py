@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Stamps of messages -> increasing times of images, for recordings and live streams."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Times as they are written in names of files and in lists, and which of them belong together."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A video file as a drive."""
 from __future__ import annotations
 

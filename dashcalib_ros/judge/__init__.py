@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Solution -> verdict with reasons -> CalibrationData.
 
 Does a given calibration explain a drive? Solution and camera -> Check; with poses, Odometry. And

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whether the turns agree on one camera, and what each of them, and one more, knows of fx."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The result of a calibration: a camera, a sigma for each parameter, a verdict with reasons."""
 from __future__ import annotations
 

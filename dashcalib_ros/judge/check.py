@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The answer: right, good enough, wrong and in which way, or that the drive cannot tell."""
 from __future__ import annotations
 

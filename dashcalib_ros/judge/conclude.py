@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Solution and evidence -> the CalibrationData that is given to the user."""
 from __future__ import annotations
 

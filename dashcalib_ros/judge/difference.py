@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How far two calibrations are apart, in one scale: the same, good enough for some uses, wrong.
 
 One answer for `check`, where a given camera meets a drive's own, and for `compare`, where two

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The scale of a gyro, from the headings of GPS: no picture has a part in it.
 
 Between two straights of a drive a car turned by the difference of their headings, whatever the

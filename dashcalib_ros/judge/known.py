@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What somebody knows of the camera, as measurements beside the turns: known.* of the settings."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Watches a camera in use, turn by turn: has it been zoomed, cropped, exchanged or moved since.
 
 A single turn may be wrong, by traffic, lost images or a bad reconstruction. So a change is

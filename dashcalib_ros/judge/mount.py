@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How the camera sits on the car: yaw, pitch, roll and height, each with its sigma.
 
 Yaw and pitch are those of the direction of travel: of pairs of images on straight stretches, and

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How well a camera finds the car's true motion: the turns' rotations and scales beside poses.
 
 The turns' paths become files in TUM's format, which evo reads and plots.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Two cameras of one car: how one is turned against the other, and whether they saw one drive.
 
 Each mounting is against the car's direction of travel and its vertical, which both cameras share:

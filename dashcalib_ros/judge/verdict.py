@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Solution -> verdict: every rule by which a result is refused or called weak.
 
 Registered images and residuals do not separate good solutions from bad ones; the focal profile,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a gyro and GPS know of a solution: the angles of the turns, without any picture.
 
 A turn's angle by the pictures depends on the focal length; by a gyro it does not. The model: from

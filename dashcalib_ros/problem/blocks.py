@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The unknowns of the one problem, one class for each kind; BLOCKS has them all.
 
 A pixel (u, v) is observed where

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Residuals -> normal equations of one stretch, with its points and then its poses eliminated.
 
 The residuals are linearised by points, by each image's pose and what else it has of its own, and

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tracks of a stretch of a drive, the poses and points that explain them, and flat arrays of both.
 
 A stretch is a turn, or any other part of a drive that was reconstructed.

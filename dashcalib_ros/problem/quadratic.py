@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a turn knows of the camera: its cost near the solution, as a quadratic function.
 
 Around the solution a turn's cost changes with a step d of the parameters by

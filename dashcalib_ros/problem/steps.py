@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The steps that lower the cost of a problem over its free blocks, structures included.
 
 A step is the optimum of the linearised problem, inside the bounds of the blocks. Where no part of

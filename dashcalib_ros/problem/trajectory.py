@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The path of a camera: poses at knots, and between them value and velocity at any time.
 
 A cubic spline goes through the centres of the camera, and one through the rotation vectors from

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One turn -> one scene: tracks, chain, registration, adjustment. COLMAP is loaded when called."""
 from __future__ import annotations
 

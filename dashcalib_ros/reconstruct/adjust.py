@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bundle adjustment of scenes that share one camera: what of them is free, and what counts."""
 from __future__ import annotations
 

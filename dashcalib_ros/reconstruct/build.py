@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A turn becomes a scene: its focal profile first, then one scene from the best start."""
 from __future__ import annotations
 

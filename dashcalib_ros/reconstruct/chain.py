@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A first scene from tracks, with a given camera: two images first, then one image at a time.
 
 Images of a drive come in order and their tracks are known, so most of incremental mapping (match

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Robust poses from viewing rays by COLMAP: the one module that loads it.
 
 zlib must be imported first: pycolmap's wheel exports the symbols of another version of zlib, and

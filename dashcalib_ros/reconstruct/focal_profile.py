@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The focal profile of a turn: how well each focal length, held fixed, explains its tracks.
 
 Incremental reconstruction with a free focal length often diverges, although it registers every

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Robust poses from viewing rays of any direction: two engines that do the same.
 
 COLMAP has the estimators that most measurements were made with, but no wheels for arm64. Where it

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where the camera points, against the car's direction of travel, from one turn's poses.
 
 A camera ahead of the rear axle moves sideways in a turn, by the path's curvature times its

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Robust poses from viewing rays by OpenCV's minimal solvers, in a RANSAC on angles.
 
 A solver takes pixels of a pinhole, which sees less than 180 degrees. So each sample is turned in

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Track positions are registered again, against one reference patch each (affine Lucas-Kanade).
 
 Tracking from image to image drifts: small errors add up along a track, most where a surface comes

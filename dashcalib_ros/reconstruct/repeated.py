@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Turns that show the same pictures: what is played again, forwards or backwards, adds nothing.
 
 Two scenes are compared by what they are made of. Where their pictures are the same, tracks that

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A reconstructed turn: tracks, poses and points, camera, focal profile; and a picture of it."""
 from __future__ import annotations
 

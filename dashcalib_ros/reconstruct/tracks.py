@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A turn's images -> tracks: the same world point followed through the keyframes.
 
 Lucas-Kanade tracks replace the paper's SIFT matches: neighbouring images of a drive differ little,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The output folder and its report.html; comparisons; what a terminal shows: tables.py."""
 from dashcalib_ros.judge import Verdict
 from dashcalib_ros.judge.difference import NamedCamera

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Calibration, as users have it: the result with its files."""
 from __future__ import annotations
 

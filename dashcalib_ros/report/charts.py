@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """SVG, the little of it that the report needs, and its plot of the drive; style.css has colours.
 
 Pictures become data URIs.

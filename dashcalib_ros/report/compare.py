@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The comparison of two calibrations: differences, in sigmas too, and the mapping error."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The output folder: files are complete or absent, and no driver can load a wrong calibration."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the page shows of the lens, of the evidence for it, and of how the camera is mounted."""
 from __future__ import annotations
 

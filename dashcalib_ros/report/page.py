@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """report.html and the page of two calibrations, each complete without other files."""
 from __future__ import annotations
 

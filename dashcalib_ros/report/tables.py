@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Results as rich renderables for a terminal; nothing is printed here."""
 from __future__ import annotations
 

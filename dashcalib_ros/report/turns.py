@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the page shows of each turn: its tracks, a view in space, and its own fx."""
 from __future__ import annotations
 
@@ -29,6 +30,8 @@ from dashcalib_ros.report.charts import (
 )
 from dashcalib_ros.report.wording import optional, since_start
 
+# where a turn goes
+RIGHT, LEFT, BACK = 'to the right', 'to the left', 'one way and back'
 # keyframes before and after the picture whose observations are drawn as a track
 TRAIL = 4
 # px of the drawing; a residual that only one of ten exceeds is drawn about so long
@@ -235,10 +238,10 @@ def _axes(rotations: Floats) -> Floats:
 
 
 def direction(scene: Scene) -> str:
-    """Return where the turn goes: 'to the right', 'to the left', or 'one way and back'."""
+    """Return where the turn goes: RIGHT, LEFT or BACK."""
     if abs(scene.right_deg) < 0.5 * scene.yaw_deg:
-        return 'one way and back'
-    return 'to the right' if scene.right_deg > 0 else 'to the left'
+        return BACK
+    return RIGHT if scene.right_deg > 0 else LEFT
 
 
 def focal_by_turn(c: CalibrationData) -> str:

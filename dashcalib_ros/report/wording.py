@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Texts and numbers that the page and the terminal have in common."""
 from __future__ import annotations
 

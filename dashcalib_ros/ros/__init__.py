@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The ROS 2 nodes; the only room that imports rclpy, and only when a node is started."""
 from __future__ import annotations
 

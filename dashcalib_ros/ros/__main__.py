@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """python -m dashcalib_ros.ros [calibrator | checker] ...: without the installed commands."""
 import sys
 

@@ -1,9 +1,10 @@
+# SPDX-License-Identifier: Apache-2.0
 """The background thread: it owns the calibrator, and does what comes into its inbox."""
 from __future__ import annotations
 
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Set
 from dataclasses import dataclass, field, replace
 from functools import reduce
@@ -21,6 +22,7 @@ from dashcalib_ros.judge import Check, Monitor, moved_text
 from dashcalib_ros.judge.agreement import CONTRADICTS, outdated, turns_of_another_camera
 from dashcalib_ros.pipeline import Calibrator, Status
 from dashcalib_ros.report import Calibration, NamedCamera
+from dashcalib_ros.report.turns import BACK, LEFT, RIGHT
 from dashcalib_ros.workers.memory import mapped_copy
 
 # s between two checks whether enough turns are built: scenes are finished without a push
@@ -29,6 +31,8 @@ LONGEST_BACK_OFF_S = 60.0
 # pairs of images of straight driving, each 0.3 s: when they are asked whether the camera was moved
 # on the car, and how many of them
 PAIRS_BETWEEN, PAIRS = 30, 120
+# kinds of turns, by where direction() says that they go
+WAYS = {RIGHT: 'right turn', LEFT: 'left turn', BACK: 'S-bend'}
 NO_STATUS = Status(0, 0, 0, 0.0, 0.0, False)
 Action = Callable[[], None]
 
@@ -438,7 +442,7 @@ def decode_checked(message: Any, size: tuple[int, int], depth: BitDepth | None =
 
 
 def new_turns(logged: Set[TurnId], now: Status, wanted: int, checking: bool) -> list[str]:
-    """Return 'turn 2 of 5: 89°, 179° in all' for each turn that is ready now and was not logged.
+    """Return 'turn 2 of 5: 89° to the left, 179° in all' for each new turn that is ready now.
 
     The total is that of the turns so far; a turn that replaces another has the last number.
     checking: the turns check a calibration in use.
@@ -452,8 +456,21 @@ def new_turns(logged: Set[TurnId], now: Status, wanted: int, checking: bool) -> 
         total += yaw
         number = f'turn {count} of {wanted}' if count <= wanted else f'turn {count}'
         source = '' if now.ready[place].of_this_drive else ' (of an earlier drive)'
-        lines.append(f'{number}{purpose}{source}: {yaw:.0f}°, {total:.0f}° in all')
+        way = f' {now.ways[place]}' if now.ways else ''
+        lines.append(f'{number}{purpose}{source}: {yaw:.0f}°{way}, {total:.0f}° in all')
     return lines
+
+
+def seen(status: Status, needed: int) -> str:
+    """Return what turns there are, and how many are missing, for who drives.
+
+    needed: turns with which a calibration begins.
+    """
+    ways = Counter(status.ways)
+    kinds = [counted(ways[way], name) for way, name in WAYS.items() if ways[way]]
+    text = f'{", ".join(kinds)}, {status.yaw_deg:.0f}° in all' if kinds else 'no turn yet'
+    missing = needed - status.built
+    return f'{text}; {counted(missing, "more turn")} needed' if missing > 0 else text
 
 
 def beginning(status: Status) -> str:

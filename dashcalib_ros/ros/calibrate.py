@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The program that calibrates: what is accepted is published beside the images, and kept."""
 from __future__ import annotations
 
@@ -301,21 +302,23 @@ class Calibrating:
         turns, monitor = self.drive.turns_text, self.drive.monitor
         self._confirmed |= monitor is not None and monitor.agrees
         camera = self._kept.camera if self._kept else None
+        sigma = camera.sigma if camera else None
         known = 'confirmed' if self._confirmed else 'unconfirmed'
         state, level, message = 'collecting', WARN, f'not calibrated yet: {turns}'
         if activity.calibrating:
             state, message = 'calibrating', f'calibrating with {turns}: {activity.stage}'
         elif verdict is not None and verdict.level != 'accepted':
             state = 'refused_so_far'
-            message = (f'not calibrated, {turns}; so far {verdict.level}: '
+            # the reason has what one more turn would bring
+            message = (f'not calibrated: {turns}; so far {verdict.level}: '
                        f'{"; ".join(verdict.reasons[:1])}')
         if self._stale:
             level = ERROR
             message = f'the published calibration is contradicted; new turns: {turns}'
         elif camera:
             state, level = 'calibrated', OK
-            message = f'calibrated, {known}; {turns} for the next check of it'
-        sigma = camera.sigma if camera else None
+            exact = f', fx ± {100 * sigma["fx"] / camera.camera.fx:.2g} %' if sigma else ''
+            message = f'calibrated, {known}{exact}; for the next check {turns}'
         mount = self._mounting.mount
         return Health(state, level, message, camera, {
             'published': sigma_text(camera) if camera else 'nothing',

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The car around the camera: its sensors come in; how the camera sits on it goes out.
 
 That is a pose, and static transforms (REP-103, REP-105). What sensors measure is kept where they

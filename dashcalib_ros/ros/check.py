@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The program that checks a driver's calibration with turns, and never changes it."""
 from __future__ import annotations
 
@@ -146,11 +147,11 @@ class Checking:
         """Return the state of the check."""
         found, turns = self._answer(), self.drive.turns_text
         if found.answer == 'right':
-            message = f'the calibration is right; {turns} for the next check'
+            message = f'the calibration is right; for the next check {turns}'
         elif found.answer in SAYS:
             message = f'the calibration {SAYS[found.answer]}{found.reasons[0]}'
         else:
-            message = f'checking the calibration, {turns}: {found.reasons[0]}'
+            message = f'checking the calibration: {found.reasons[0]}; {turns}'
         return Health('checking', _level(found), message, self._given if self._fits else None, {
             'check': found.answer, 'check reasons': '; '.join(found.reasons)}, self._warnings())
 

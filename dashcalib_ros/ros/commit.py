@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A calibration for the camera driver: its service set_camera_info."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Problems are counted and logged now and then; what the node does is in /diagnostics."""
 from __future__ import annotations
 

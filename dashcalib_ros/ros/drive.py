@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Images in, turns learned from them, and what these turns say of the camera in use.
 
 Both roles, calibrate.py and check.py, are built on it. Every method and callback runs in the
@@ -29,6 +30,7 @@ from dashcalib_ros.ros.background import (
     Result,
     Trouble,
     Watched,
+    seen,
 )
 from dashcalib_ros.ros.car import subscribe_sensors
 from dashcalib_ros.ros.diagnostics import ERROR, WARN, Health, diagnostic
@@ -330,9 +332,9 @@ class Drive:
 
     @property
     def turns_text(self) -> str:
-        """Return how many turns there are for the next calibration, in words."""
-        now, wanted = self.learner.activity.status, self._goal.config.turns.wanted
-        return f'{min(now.built, wanted)} of {wanted} turns, {now.yaw_deg:.0f}° of yaw'
+        """Return what turns there are for the next calibration and how many are missing."""
+        goal = self._goal
+        return seen(self.learner.activity.status, goal.turns or goal.config.turns.wanted)
 
     def _tick(self) -> None:
         self.catch_up()

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Makes what a configured node has in ROS, and takes all of it back."""
 from __future__ import annotations
 

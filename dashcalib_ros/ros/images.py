@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The camera's images: subscribed, separated from strays, and reported when they are missing.
 
 All of this runs in the executor's thread. It reads no pixels, but of images that seem to be of

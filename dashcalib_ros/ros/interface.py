@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The topics and services of both programs, each in one place; no ROS is imported.
 
 The endpoints are made from these tables, and --help and docs/ros_interface.md are written from

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The node: its parameters, its lifecycle, and what answers where a callback fails."""
 from __future__ import annotations
 
@@ -207,7 +208,8 @@ class CameraNode(LifecycleNode):  # type: ignore[misc]
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
         """Set parameters as rclpy does; refuse unknown and read-only ones with the cure.
 
-        rclpy refuses these before it asks any callback, and without saying what to do.
+        rclpy refuses these without saying what to do, before it asks the callback that may give a
+        reason; the one that it asks earlier may give none (rclcpp pull request 1947 has both).
         """
         try:
             check_changeable(self, self._program, (each.name for each in parameter_list))

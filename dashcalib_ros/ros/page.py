@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Writes docs/ros_interface.md: python -m dashcalib_ros.ros.page > docs/ros_interface.md."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The node's parameters: settings of the core by their own names, the node's own, and QoS."""
 from __future__ import annotations
 
@@ -38,6 +39,7 @@ def given_parameters(program: str) -> dict[str, Any]:
     """Return the parameters that a program's node is given at the start, known or not.
 
     rclpy tells them only by declaring all, without ranges and for good: on a node of their own.
+    rclcpp does not tell them either (its issue 1907).
     """
     make = functools.partial(Node, program, enable_rosout=False, start_parameter_services=False)
     try:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pictures for people: tracks, mask and state, and the picture without distortion.
 
 They are drawn and published in a thread of their own while someone subscribes.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From the command line to a spinning node and back to an exit code."""
 from __future__ import annotations
 

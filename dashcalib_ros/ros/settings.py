@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The node's settings and its command line; no ROS is imported.
 
 Writes config/calibrator.yaml: python -m dashcalib_ros.ros.settings > config/calibrator.yaml.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """When a calibration is published, replaced or given up: pure functions, no ROS.
 
 A car always collects turns, but the published calibration must be stable. After an accepted one a

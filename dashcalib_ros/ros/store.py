@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The accepted calibration on disk: where, whose, and whether it was edited or cannot be."""
 from __future__ import annotations
 
@@ -28,7 +29,8 @@ from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
 from dashcalib_ros.report import Calibration, NamedCamera, set_aside, write_text
 from dashcalib_ros.whole_files import prepared, remove_leftovers
 
-# camera_info_manager's
+# camera_info_manager's; its Python port is not used, as it reads no file under ROS 2: it sets
+# CameraInfo.K, which is k there (image_common issue 354)
 DEFAULT = 'file://${ROS_HOME}/camera_info/${NAME}.yaml'
 KNOWN = 'file:///folder/camera.yaml, package://package/folder/camera.yaml, or a path'
 # of the width: 170 to 11 degrees across without distortion, or 570 as a fisheye
@@ -41,6 +43,9 @@ BESIDE = 0.5
 STRETCH = 2.0
 # of the way from the principal point to a corner
 STEPS = 33
+# of the reader, for numbers with which nothing can be computed: formats/plausible.py
+NO_LENS = frozenset(f'E-CALIBRATION-{each}' for each in (
+    'ASPECT', 'CENTRE', 'EMPTY', 'EXCHANGED', 'FOCAL', 'LENS', 'NO-RAY', 'OTHER-SIZE'))
 # in the block dashcalib, but not in its checksum
 CHECKSUM, COUNT = 'checksum', 'contradictions'
 
@@ -89,28 +94,28 @@ class StoredCalibration:
     def read(cls, text: str, path: Path, whose: CameraIdentity) -> StoredCalibration:
         """Read a file's text; raises InputError unless it is of this node's camera.
 
-        Whether it is plausible is not asked.
+        With the code E-KEPT-IMPLAUSIBLE for this camera's file with numbers that no lens has.
         """
-        camera = parse_camera(text, path)
+        try:
+            camera = parse_camera(text, path)
+        except InputError as error:
+            content = parse_yaml(text, str(path)) if error.code in NO_LENS else None
+            if not isinstance(content, dict) or not isinstance(content.get('dashcalib'), dict):
+                raise
+            _check_owner(content, whose)
+            raise InputError('E-KEPT-IMPLAUSIBLE', str(error)) from error
         if camera.verdict != 'accepted' or camera.sigma is None:
             raise InputError('E-KEPT-NOT-ACCEPTED',
                              'it is not an accepted calibration of this node; it is moved aside '
                              'when the node has one')
         content = parse_yaml(text, str(path))
+        _check_owner(content, whose)
+        if why := implausible(camera):
+            raise InputError('E-KEPT-IMPLAUSIBLE', why)
         own = content['dashcalib']
-        name, topic = content.get('camera_name'), own.get('topic')
-        if name != whose.name:
-            raise InputError('E-KEPT-OF-OTHER-CAMERA',
-                             f'it belongs to the camera {name}, and this one is {whose.name}; it '
-                             f'is moved aside when this one is calibrated')
-        if topic != whose.topic and not (topic is None and whose.plain):
-            of = f'belongs to the images on {topic}' if topic else 'is older and names no topic'
-            raise InputError('E-KEPT-OF-OTHER-TOPIC',
-                             f'it {of}, and this node uses {whose.topic}; set camera_name so '
-                             f'that each camera has its own file')
         count, frame_id = own.get(COUNT, 0), own.get('frame_id')
         # an older file has neither
-        older = topic is None and CHECKSUM not in own
+        older = own.get('topic') is None and CHECKSUM not in own
         edited = not older and own.get(CHECKSUM) != _checksum(content)
         return cls(camera, None if frame_id is None else str(frame_id), content,
                    count if type(count) is int and count > 0 else 0, edited,
@@ -223,17 +228,13 @@ class Store:
             text = read_text(self.path, YAML_BYTES)
             kept = StoredCalibration.read(text, self.path, self._whose)
         except InputError as error:
-            raise InputError(error.code, f'{self.path} is ignored: {error}') from error
+            text = (f'{self.path} is not used: {error}; {self._moved_aside()}'
+                    if error.code == 'E-KEPT-IMPLAUSIBLE' else f'{self.path} is ignored: {error}')
+            raise InputError(error.code, text) from error
         except (OSError, ValueError, OverflowError) as error:
             raise InputError('E-KEPT-UNREADABLE', f'{self.path} is ignored: {error}') from error
         if self.given_up:
             raise InputError('E-KEPT-WITHDRAWN', self.given_up)
-        if why := implausible(kept.camera):
-            try:
-                end = f'it is now {set_aside(self.path)}'
-            except OutputError as error:
-                end = str(error)
-            raise InputError('E-KEPT-IMPLAUSIBLE', f'{self.path} is not used: {why}; {end}')
         self._text = text
         # its sigma may be what was edited
         return replace(kept, camera=replace(kept.camera, sigma=None)) if kept.edited else kept
@@ -286,6 +287,13 @@ class Store:
         self._text = self._given_up = None
         return f'{self.path} is now {moved}' if moved else 'there was no file'
 
+    def _moved_aside(self) -> str:
+        """Set the file aside; return where it is now, or why it is not."""
+        try:
+            return f'it is now {set_aside(self.path)}'
+        except OutputError as error:
+            return str(error)
+
     @property
     def _ours(self) -> bool:
         return self._text is not None and self._read() == self._text
@@ -307,6 +315,20 @@ def _not_written(path: Path, why: Exception | str) -> OutputError:
     return OutputError('E-KEPT-NOT-WRITABLE',
                        f'cannot write {path}: {reason}; set camera_info_url to a file in a folder '
                        f'that you may write to')
+
+
+def _check_owner(content: Mapping[str, Any], whose: CameraIdentity) -> None:
+    """Raise InputError for the file of another camera than this node's."""
+    name, topic = content.get('camera_name'), content['dashcalib'].get('topic')
+    if name != whose.name:
+        raise InputError('E-KEPT-OF-OTHER-CAMERA',
+                         f'it belongs to the camera {name}, and this one is {whose.name}; it is '
+                         f'moved aside when this one is calibrated')
+    if topic != whose.topic and not (topic is None and whose.plain):
+        of = f'belongs to the images on {topic}' if topic else 'is older and names no topic'
+        raise InputError('E-KEPT-OF-OTHER-TOPIC',
+                         f'it {of}, and this node uses {whose.topic}; set camera_name so that '
+                         f'each camera has its own file')
 
 
 def implausible(kept: NamedCamera) -> str:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The packets of a video -> messages of images, decoded in a thread of their own."""
 from __future__ import annotations
 

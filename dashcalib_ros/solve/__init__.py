@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scenes -> one shared camera with its covariance (paper, 3.2), as one problem.
 
 The lens, a rolling shutter's readout, a smooth field over the picture, where a stabiliser moves

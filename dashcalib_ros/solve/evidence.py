@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What is there, decided at the common optimum: the kind of lens, a picture that moves or is bent.
 
 A kind of lens is judged by the turns that did not make it: each is left out in turn. At the

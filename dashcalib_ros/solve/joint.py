@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scenes -> one camera: a start for each kind of lens, then one problem of all blocks."""
 from __future__ import annotations
 

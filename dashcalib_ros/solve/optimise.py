@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The problem of all turns: its state, the sizes of its priors by the evidence, and its steps."""
 from __future__ import annotations
 

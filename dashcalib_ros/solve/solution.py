@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the optimum says: the camera to write, how far it may be off, and what is named."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How far the result may be off: one covariance of all that turns share.
 
 Two things make it. The errors of tracks: each track is one measurement, as its observations share

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where the one problem starts: kinds of lenses, focal profiles, turns chained anew.
 
 A turn was reconstructed with a camera of its own. Here it is brought to a common one, and a focal

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The camera that is written: the model of ROS that comes closest to lens and field together.
 
 camera_info has no field, and no p1, p2, k3 where nobody can see them. So each model of the lens's

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scenes in a file, without pictures: turns.store and fleets write, read and check the same.
 
 The format (docs/fleet.md): an .npz without pickle, with a JSON text `about` and arrays for each

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A folder of reconstructed turns, so that short trips add up (config: turns.store).
 
 There is one file for each turn. It is written completely under a unique name, and never changed:

@@ -1,1 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where stages run: child processes, or this one; with equal results."""

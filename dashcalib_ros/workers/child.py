@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A worker in a child process: COLMAP aborts its process when a check fails.
 
 The parent sends (function, arguments) and receives progress, then a result or an exception, each
@@ -140,7 +141,7 @@ class ChildWorker:
     def _start(self) -> subprocess.Popen[bytes]:
         environment = dict(os.environ)
         environment['PYTHONPATH'] = os.pathsep.join(path or str(Path.cwd()) for path in sys.path)
-        environment.update({name: '1' for name in THREAD_VARIABLES})
+        environment.update(dict.fromkeys(THREAD_VARIABLES, '1'))
         command = [sys.executable, '-c', START, str(LOW_PRIORITY if self._low_priority else 0),
                    str(os.getpid()), str(self._threads)]
         try:

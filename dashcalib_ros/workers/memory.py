@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where images are in memory: what lasts for one message is reused, what is kept is apart.
 
 glibc maps large blocks separately and returns them as soon as they are freed. Every image then

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A few workers reconstruct turns, and do what is waited for, while the drive goes on."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Workers run a function in another process (child.py), or in this one, as debuggers want it."""
 from __future__ import annotations
 

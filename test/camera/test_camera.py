@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The camera model against OpenCV's, its inverse, and where it folds over."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Cameras compared by what they do: the mapping error, its derivatives, one lens in two models."""
 from __future__ import annotations
 

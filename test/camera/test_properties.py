@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What holds for every camera whose parameters are in their ranges."""
 from __future__ import annotations
 

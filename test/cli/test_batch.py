@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """dashcalib batch: exit codes, and what stands on the streams."""
 from __future__ import annotations
 

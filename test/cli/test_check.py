@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """dashcalib check around a calibrator of our own making: what the command itself decides."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """run and turns around a calibrator of our own making: all that the command itself decides."""
 from __future__ import annotations
 

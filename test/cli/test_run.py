@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The installed core end to end: the demo's bag through the command, in processes of its own."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What moves on a terminal while a stage works."""
 from __future__ import annotations
 

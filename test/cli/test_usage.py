@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The command as a user meets it: help, usage, missing input, compare, streams.
 
 In a process of its own where that is what matters; elsewhere here, which takes no second to start.

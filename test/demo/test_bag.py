@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A rendered drive as a bag."""
 from __future__ import annotations
 

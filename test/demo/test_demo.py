@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The rendered drives are exact: every other test that uses them relies on this one."""
 from __future__ import annotations
 

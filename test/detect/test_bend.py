@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How a camera bends straight lines: made lines, whose truth is known."""
 from __future__ import annotations
 

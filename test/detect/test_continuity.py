@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whether an image follows the one before, on points that are projected exactly."""
 from __future__ import annotations
 

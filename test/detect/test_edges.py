@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Upright edges in made pictures."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The ego-vehicle mask: what it covers of a rendered vehicle, and what it leaves alone."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Motion: epipoles that are known exactly, thinning by time, standing, and real drives."""
 from __future__ import annotations
 

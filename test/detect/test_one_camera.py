@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whether a stream has the images of two cameras: what thinning leaves out is looked at."""
 from __future__ import annotations
 

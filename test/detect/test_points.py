@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Points are followed from image to image: far, in small pictures, with any number of threads."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The user's segmentation model: what it is asked, how it adds up, what is said of a bad one."""
 from __future__ import annotations
 

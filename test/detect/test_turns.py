@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The streaming detector against scipy and numpy offline, and the bank's bounds."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What becomes of the lines in a calibration: its fields, its files, its verdict."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A fleet from its manifest to its tables: killed, started again, cut into shards, in memory."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Engines: every task has one outcome, whatever becomes of the workers."""
 from __future__ import annotations
 

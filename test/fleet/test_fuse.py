@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The clips of one camera are one calibration; what contradicts is named and left out."""
 from __future__ import annotations
 

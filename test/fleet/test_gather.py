@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Gathering: a pure function of a clip's content and the settings."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The prior of a make: from units that know little, it learns what they share."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Manifests of every kind, and bad ones: what is wrong with a row stands in the row."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Files here and in memory:// are whole or absent, and clips are copied, never mounted."""
 from __future__ import annotations
 

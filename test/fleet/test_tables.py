@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The tables' rows: drift over time, texts of any kind, the overview."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Exports: each read back by the program it is for, or by its format's rules."""
 from __future__ import annotations
 

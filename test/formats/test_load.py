@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """load_camera(): other programs' files, which camera is meant, and what is refused."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """result.json: the contract, strict JSON, and reading it back."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The mounting as URDF and as a static transform, by the rules of both."""
 from __future__ import annotations
 

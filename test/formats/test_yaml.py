@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """calibration.yaml: camera_calibration_parsers' keys, order and layout, at full precision."""
 from __future__ import annotations
 

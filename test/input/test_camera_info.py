@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """dashcalib run --write-bag: the bag again, with camera_info beside each image."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a file is tells its content first, its name second."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Recordings whose recorder was killed: all that was written is read, or what is lost is said."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Image messages become the right grey pixels, whatever their encoding."""
 import array
 import gzip

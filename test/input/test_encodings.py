@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Videos in messages, Foxglove's messages in protobuf and JSON, and what is not read."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Videos, folders and what is no drive; broken ones say what is wrong, in one line."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The size of an encoded picture, read from its first bytes; what is too large stays packed."""
 from __future__ import annotations
 

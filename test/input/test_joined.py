@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Several files of one camera as one drive, and parts of a drive."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Motion streams from files, bags and live samples."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bags that are bombs, and folders of bags with odd entries in them."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Messages in any order, in any file, with any part of an index: all by time, none lost."""
 from __future__ import annotations
 

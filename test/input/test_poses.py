@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """True poses from files, and those of a GPS track."""
 from __future__ import annotations
 

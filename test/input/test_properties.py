@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whatever bytes and stamps come from outside: a value or an InputError, nothing else."""
 from __future__ import annotations
 

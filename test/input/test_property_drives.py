@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Drives of any damage, and of any parts: nothing is lost without a word, nothing is made up."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bags of every kind come in as the same frames; of broken ones comes what is left."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pictures are resized so that every pixel's place is known exactly."""
 from __future__ import annotations
 

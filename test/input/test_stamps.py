@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The stamp gate, for recordings and for live streams: order, losses, set-backs, thinning."""
 from __future__ import annotations
 

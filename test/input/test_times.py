@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Times and order of the images of a folder: by names, lists and numbers."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Videos: each picture's own time, whatever the container; turned, cut and hostile ones."""
 from __future__ import annotations
 

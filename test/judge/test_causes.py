@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What makes the other reasons comes first, and in the words of the input."""
 from __future__ import annotations
 

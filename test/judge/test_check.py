@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a drive of made turns says of calibrations that are right and of some that are not."""
 from __future__ import annotations
 

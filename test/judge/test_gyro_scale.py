@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A gyro's scale by the headings of GPS, on drives on paper."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Changes of a camera in use: what turns say that were taken with another lens or mounting."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How the camera sits on the car: made pairs of images, made turns, and what makes it weak."""
 from __future__ import annotations
 

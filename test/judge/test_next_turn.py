@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What one more turn would bring is what it brings."""
 from __future__ import annotations
 

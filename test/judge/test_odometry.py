@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How far cameras are from true poses."""
 from __future__ import annotations
 

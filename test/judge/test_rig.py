@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Two cameras of one car: rendered, one ahead and one back, and made mountings."""
 from __future__ import annotations
 

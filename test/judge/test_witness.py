@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What straight lines add to a check."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A gyro and GPS as witnesses of a solution whose truth is known."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The normal equations: derivatives agree with differences, also behind a rolling shutter."""
 from __future__ import annotations
 

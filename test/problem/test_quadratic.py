@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Costs near the solution: added up, with parameters fixed or eliminated, at their optimum."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The steps to the optimum of a problem: to the minimum that SciPy finds, too."""
 from __future__ import annotations
 

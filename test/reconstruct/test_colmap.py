@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What COLMAP logs goes to stderr only."""
 from __future__ import annotations
 

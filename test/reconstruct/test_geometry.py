@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Poses from viewing rays, with each engine: exact, robust, in any direction, repeatable."""
 from __future__ import annotations
 

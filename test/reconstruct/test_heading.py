@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which way up the pictures are, and by how much the car turned, whichever way that is."""
 from __future__ import annotations
 

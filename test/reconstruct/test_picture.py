@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The one picture of each turn that people see."""
 from __future__ import annotations
 

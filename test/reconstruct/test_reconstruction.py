@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Turns of exact truth -> tracks -> scenes: chaining, triangulation, adjustment, registration."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Turns of the same pictures count once: forwards, backwards, moved in time, and in parts."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The page in a real browser, where there is one: nothing is cut, no text over other text."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A Calibration in a program's hands: one line of text, K and D, pictures without distortion."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Comparing calibrations: against numbers of the scoring tool, and by construction."""
 from __future__ import annotations
 

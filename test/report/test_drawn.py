@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the page draws: turns with their reasons, maps, plots, and lines that work when copied."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The output folder: whole files only, and no wrong calibration where a driver would load it."""
 from __future__ import annotations
 

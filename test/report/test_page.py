@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """report.html: what it shows, and that nothing breaks out."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The terminal's tables: what they show, within 80 columns."""
 from __future__ import annotations
 

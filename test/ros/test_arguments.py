@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The command line: help, files of parameters, and where the calibration's file is."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The node among other programs: QoS overrides, lifecycle, missing images, viewers."""
 from __future__ import annotations
 
@@ -224,6 +225,7 @@ def foxglove_topics(layout):
     found = set()
     for panel in layout['configById'].values():
         found |= {panel.get('topicToRender'), panel.get('imageMode', {}).get('imageTopic')}
+        found |= set(panel.get('topics', ()))
         found |= topics_of(path['value'] for path in panel.get('paths', ()))
     return found - {None}
 
@@ -247,8 +249,9 @@ def test_viewers_show_topics_that_there_are(start_node, make_bench):
         'calibrator', '/')}
     assert in_foxglove <= published | heard and in_rviz <= published | heard
     pictures = {'/image_raw', '/calibrator/overlay/compressed', '/calibrator/rectified/compressed'}
-    assert in_rviz == pictures
-    assert in_foxglove == pictures | {'/diagnostics', '/calibrator/turn_magnitude', '/rosout'}
+    assert in_rviz == pictures | {'/calibrator/mount'}
+    assert in_foxglove == pictures | {'/calibrator/mount', '/diagnostics',
+                                      '/calibrator/turn_magnitude', '/rosout'}
 
 
 def test_the_layout_for_foxglove_places_each_panel_once():
@@ -258,7 +261,7 @@ def test_the_layout_for_foxglove_places_each_panel_once():
                            'layout'}
     assert panels_in(layout['layout']) == set(layout['configById'])
     kinds = sorted(name.partition('!')[0] for name in layout['configById'])
-    assert kinds == ['DiagnosticStatusPanel', 'Image', 'Image', 'Image', 'Plot', 'RosOut',
+    assert kinds == ['3D', 'DiagnosticStatusPanel', 'Image', 'Image', 'Image', 'Plot', 'RosOut',
                      'StateTransitions']
     for name, panel in layout['configById'].items():
         # a path without them draws nothing
@@ -272,7 +275,9 @@ def test_the_configuration_for_rviz_has_what_rviz_writes():
     manager = data['Visualization Manager']
     assert {'Class', 'Displays', 'Global Options', 'Tools', 'Views'} <= set(manager)
     for each in manager['Displays']:
-        assert each['Class'] == 'rviz_default_plugins/Image' and each['Enabled']
+        assert each['Class'].partition('/')[::2] in (
+            ('rviz_default_plugins', 'Image'), ('rviz_default_plugins', 'PoseWithCovariance'))
+        assert each['Enabled']
         assert each['Topic']['Reliability Policy'] in ('Reliable', 'Best Effort')
 
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The launch file of several cameras. launch is not on the package index: where it is not
 installed, replacements record what the file makes."""
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The node that only checks a driver's calibration, and the watch over one in use.
 
 The real node in this process, between real publishers; turns, and what they say, come by command.

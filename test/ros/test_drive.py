@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A rendered drive, published to the node until it is calibrated: between real processes."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What is installed with the node: its parameters' file, profiles, launch files; colcon's view."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the node does with a calibration: published, kept on disk, replaced, given up, committed.
 
 The real node in this process, between real publishers; only the calibrations are made up here,
@@ -46,13 +47,17 @@ MOUNT = Mount('accepted', (), 2.0, -1.0, None, None,
 
 def test_its_life_with_a_camera_that_is_bumped(make_desk):
     desk = make_desk()
+    desk.show()
+    assert desk.bench.status.message == 'not calibrated yet: no turn yet; 5 more turns needed'
     desk.give('weak')
     assert desk.show() is None and desk.bench.values['state'] == 'refused_so_far'
+    assert desk.bench.status.message.endswith('; so far weak: few turns')
     assert desk.bench.values['reasons'] == 'few turns'
     desk.give()
     assert desk.show() == 400.0
     assert load_camera(desk.file).camera.fx == 400.0
     assert desk.bench.values['state'] == 'calibrated'
+    assert desk.bench.status.message.startswith('calibrated, confirmed, fx ± 0.5 %; for the next ')
     # confirmed, but no better
     desk.give(fx=401.0)
     assert desk.show() == 400.0

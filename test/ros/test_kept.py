@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The file that the node keeps: whose it is, who else has it, and what edits make of it."""
 from __future__ import annotations
 
@@ -155,6 +156,19 @@ def test_what_no_lens_has_is_set_aside(store, keys, value, sealed):
     assert raised.value.code == 'E-KEPT-IMPLAUSIBLE'
     assert not mine.path.exists() and mine.path.with_name('camera.previous.yaml').exists()
     assert mine.load() is None
+
+
+@pytest.mark.parametrize(('key', 'value', 'code'), [
+    ('camera_name', 'rear', 'E-KEPT-OF-OTHER-CAMERA'), ('dashcalib', {}, 'E-KEPT-OF-OTHER-TOPIC'),
+    ('dashcalib', None, 'E-CALIBRATION-ASPECT')])
+def test_what_no_lens_has_stays_where_the_file_is_of_others(store, key, value, code):
+    mine = store(dataclasses.replace(FRONT, plain=False))
+    mine.save(kept_of())
+    edit(mine.path, 'camera_matrix', 'data', 0, value=20.0)
+    edit(mine.path, key, value=value)
+    with pytest.raises(InputError) as raised:
+        mine.load()
+    assert raised.value.code == code and mine.path.exists()
 
 
 def test_what_is_no_file_or_cannot_be_written_is_told_at_once(store, tmp_path):

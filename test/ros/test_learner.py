@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The background thread: when it calibrates, what a failure costs, how it ends."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The lifecycle in this process: nothing is left behind, whatever the order of transitions."""
 from __future__ import annotations
 
@@ -104,7 +105,7 @@ def test_200_random_transitions_leave_nothing(make_node, tmp_path, program):
 
 def fail_once(node, error):
     """Let the next configure fail after the threads were started."""
-    def create_service(*arguments):
+    def create_service(*arguments, **options):
         del node.create_service
         raise error
     node.create_service = create_service

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How the camera sits on the car, from the node; and the sensors that it listens to."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The node between real processes: stopped in every state, fed bad input, asked for services."""
 from __future__ import annotations
 

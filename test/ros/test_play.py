@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """examples/play.py: who has ROS 2 from pip feeds the node with it."""
 from __future__ import annotations
 

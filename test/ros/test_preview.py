@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Overlay and rectified picture: what they show, and that they cost nothing unless watched."""
 from __future__ import annotations
 
@@ -54,7 +55,8 @@ def test_the_ego_vehicle_is_tinted_also_where_its_mask_is_smaller():
 def test_the_state_is_written_on_a_bar_and_fits(size):
     grey = np.full(size[::-1], 200, np.uint8)
     picture = Picture(None, grey, EMPTY, None)
-    drawn = overlay(picture, 'not calibrated yet: 2 of 5 turns, 179° of yaw')
+    drawn = overlay(picture, 'not calibrated yet: 1 right turn, 1 left turn, 179° in all; '
+                             '3 more turns needed')
     bar = np.flatnonzero(drawn[:, 0, 0] == 50)
     assert len(bar) and bar[-1] == size[1] - 1
     ink = drawn[bar].max(axis=(0, 2)) > 60

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """When a calibration is adopted, kept, replaced or given up: no ROS needed."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How the spinning ends, and that nothing of rclpy but its public interface is used."""
 from __future__ import annotations
 

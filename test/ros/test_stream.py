@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the image callback does: strays, the queue, complaints."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The node hears a video: packets of H.264 in messages."""
 from __future__ import annotations
 

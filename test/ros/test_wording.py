@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the node says while it learns, one line for each event: no ROS needed."""
 from __future__ import annotations
 
@@ -6,14 +7,15 @@ from dashcalib_ros.detect import TurnId
 from dashcalib_ros.judge import TurnSummary, Verdict
 from dashcalib_ros.pipeline import Status
 from dashcalib_ros.report import Calibration
-from dashcalib_ros.ros.background import beginning, new_turns
+from dashcalib_ros.report.turns import BACK, LEFT, RIGHT
+from dashcalib_ros.ros.background import beginning, new_turns, seen
 from dashcalib_ros.ros.state import outcome_text
 
 
-def status(*turns):
-    """Return a status with these (turn, yaw)."""
+def status(*turns, ways=()):
+    """Return a status with these (turn, yaw); ways: where they go."""
     keys, yaws = tuple(turn for turn, _ in turns), tuple(yaw for _, yaw in turns)
-    return Status(10, len(turns), len(turns), sum(yaws), 0.1, False, keys, 0, yaws)
+    return Status(10, len(turns), len(turns), sum(yaws), 0.1, False, keys, 0, yaws, ways=ways)
 
 
 def lines(told, now, wanted=5, checking=False):
@@ -33,6 +35,15 @@ def test_each_new_turn_is_one_line():
 def test_turns_that_come_together_are_numbered_on():
     assert lines({A}, status((B, 60.0), (A, 90.0), (C, 30.0))) == [
         'turn 2 of 5: 60°, 150° in all', 'turn 3 of 5: 30°, 180° in all']
+
+
+def test_who_drives_reads_which_turns_there_are_and_how_many_are_missing():
+    assert seen(status(), 5) == 'no turn yet; 5 more turns needed'
+    some = status((A, 90.0), (B, 60.4), (C, 30.0), ways=(RIGHT, LEFT, RIGHT))
+    assert seen(some, 4) == '2 right turns, 1 left turn, 180° in all; 1 more turn needed'
+    assert seen(status((A, 90.0), ways=(BACK,)), 1) == '1 S-bend, 90° in all'
+    assert lines(set(), status((A, 90.0), ways=(LEFT,))) == [
+        'turn 1 of 5: 90° to the left, 90° in all']
 
 
 def test_stored_turns_and_checks_are_told_as_such():

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which kind of lens the turns prove, and which model of it is written."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What turns say of a calibration that was made without them."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Turns of earlier drives: of the same camera they help, of another they must not harm unseen."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The smooth field that no lens model has: found where there is one, and nowhere else."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A fixed camera's picture stands; one that moves, zooms or is bent is found and named."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A rolling shutter is found and measured, also in a car that shakes; a global one stays one."""
 from __future__ import annotations
 

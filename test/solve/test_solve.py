@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scenes -> a camera, sigmas that are honest, and a verdict for every kind of evidence."""
 from __future__ import annotations
 

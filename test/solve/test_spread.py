@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What turns know together: how much they differ is learnt from them, and is in sigma."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scenes in a file: what is written comes back, and nothing else comes in."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Turns on disk: what is written comes back, what is not ours is left alone, nothing raises."""
 from __future__ import annotations
 

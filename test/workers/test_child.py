@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The child process: answers, errors, and every way for either side to die."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The worker without a process: the same answers and errors, one call at a time."""
 from __future__ import annotations
 

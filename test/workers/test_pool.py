@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The pool of workers: every turn once, in order, whatever its worker dies of."""
 from __future__ import annotations
 
