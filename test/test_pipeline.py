@@ -487,7 +487,8 @@ def test_turns_of_this_drive_come_before_more_prominent_ones_of_earlier_drives(o
     scene = garbage()
     turns = tuple(types.SimpleNamespace(id=TurnId.at(n), prominence=0.01) for n in range(own))
     selection = SceneSelection(QUICK.replace({'turns.wanted': 3}),
-                               types.SimpleNamespace(turns=lambda: turns), types.SimpleNamespace(
+                               types.SimpleNamespace(turns=lambda: turns, stretches=tuple),
+                               types.SimpleNamespace(
                                    scenes=lambda: {turn.id: replace(scene, turn=turn.id)
                                                    for turn in turns}))
     selection.want(3, more)
@@ -504,7 +505,8 @@ def test_the_least_turns_wait_for_better_ones(frames, more_to_come, begun):
     nothing.exchange = nothing.release = nothing.keep_only = nothing.start = lambda *given: None
     selection = SceneSelection(
         QUICK.replace({'turns.wanted': 5}),
-        types.SimpleNamespace(**vars(nothing), turns=lambda: turns, valid=lambda: None),
+        types.SimpleNamespace(**vars(nothing), turns=lambda: turns, stretches=tuple,
+                              valid=lambda: None),
         types.SimpleNamespace(**vars(nothing), scenes=dict,
                               submit=lambda turn, valid: submitted.append(turn.center)))
     selection.submit(more_to_come)

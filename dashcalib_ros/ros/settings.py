@@ -22,6 +22,8 @@ from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
 from dashcalib_ros.ros.interface import CALIBRATOR, CHECKER, PUBLISHED, SERVICES, SUBSCRIBED
 
 # these take effect at once; all others are read-only while the node runs
+# an array of integers; the core has it as a text
+LIST = 'mask.segmentation_classes'
 CHANGEABLE = ('commit', 'publish_stale', 'turns.wanted')
 # a checker publishes and keeps nothing
 CALIBRATOR_ONLY = frozenset((
@@ -162,8 +164,7 @@ def with_changes(core: Config, own: NodeConfig, values: Mapping[str, Any]
     values: as parameters have them, see ros_value(), or as the core has them.
     """
     names = {spec.name for spec in dataclasses.fields(NodeConfig)}
-    lists = {name for name, spec in describe() if spec.metadata['pattern']}
-    values = {name: ','.join(map(str, value)) if name in lists and not isinstance(
+    values = {name: ','.join(map(str, value)) if name == LIST and not isinstance(
         value, (int, str)) else value for name, value in values.items()}
     return (core.replace({name: value for name, value in values.items() if name not in names}),
             dataclasses.replace(own, **{name: value for name, value in values.items()
@@ -172,7 +173,8 @@ def with_changes(core: Config, own: NodeConfig, values: Mapping[str, Any]
 
 def ros_value(spec: dataclasses.Field[Any], value: Any) -> Any:
     """Return a setting's value as a parameter has it: the core has a list of numbers as a text."""
-    return [int(each) for each in value.split(',')] if spec.metadata['pattern'] else value
+    is_list = LIST.endswith(f'.{spec.name}')
+    return [int(each) for each in value.split(',')] if is_list else value
 
 
 def help_text(program: str) -> str:

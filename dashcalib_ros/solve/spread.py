@@ -130,6 +130,11 @@ class Posterior:
         spread[np.ix_(self.own, self.own)] += self.alike_in_all
         return np.asarray(spread)
 
+    def erring_together(self, size: float) -> Posterior:
+        """Return it where all turns may be off by the same share of fx, with a sigma of size."""
+        along = size * self._along_fx[self.own]
+        return replace(self, alike_in_all=self.alike_in_all + along @ along.T)
+
     @property
     def rival_share(self) -> float:
         """Return the probability that another prior holds than the one of the optimum."""
