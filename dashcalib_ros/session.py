@@ -364,6 +364,6 @@ def check(given: Given, path: Paths, fps: float | None = None, config: Settings 
     settings = _settings(config, model)
     with in_order(given, path):
         drive = open_drive(path, topic, fps, start_s, duration_s, mask, motion)
-        named = given_camera(given)
+        named = given_camera(given, drive.source.first_size)
     with _Progress(progress) as observer:
         return check_drive(drive, named, settings, observer).check

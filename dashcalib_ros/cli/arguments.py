@@ -29,9 +29,9 @@ INPUT_HELP = ('a ROS 2 bag (folder, .mcap, .db3), a ROS 1 .bag, a video, or a fo
 EXIT_HELP = ('exit codes: 0 accepted; 3 weak or refused (the input was fine, the evidence was '
              'not enough); 2 bad input or usage')
 CALIBRATION_HELP = ('result.json (or its folder), calibration.yaml, a file of ROS, OpenCV, '
-                    'Kalibr, COLMAP, nerfstudio, OpenSfM or mrcal, a JSON of fx, fy, cx, cy, k1, '
-                    'k2 ..., width and height, or a bag with camera_info; FILE:NAME for one of '
-                    'several cameras')
+                    'Kalibr, COLMAP, of a SLAM program or a data set (docs/formats.md has all), a '
+                    'JSON of fx, fy, cx, cy, k1, k2 ..., width and height, or a bag with '
+                    'camera_info; FILE:NAME for one of several cameras')
 SHORT_EXIT_HELP = 'exit codes: 0 done; 2 bad input or usage'
 CHECK_EXIT_HELP = ('exit codes: 0 right, or differs but is good enough; 1 wrong; 3 the drive '
                    'cannot tell; 2 bad input or usage')
@@ -39,8 +39,9 @@ BATCH_EXIT_HELP = ('exit codes: 0 every clip was read and no camera was refused;
                    'not be read or a camera was refused; 2 bad manifest or usage')
 # names of models, exports and demos; to take them from their tables would load OpenCV
 MODELS = ('auto', 'radial', 'brown', 'fisheye')
-KINDS = ('colmap', 'gyroflow', 'kalibr', 'opensfm', 'nerfstudio', 'mrcal', 'foxglove', 'ros',
-         'opencv', 'rays', 'maps', 'urdf', 'tf')
+KINDS = ('orbslam', 'vins', 'openvins', 'stella', 'svo', 'droid', 'metashape', 'matlab', 'colmap',
+         'colmap-db', 'gyroflow', 'kalibr', 'opensfm', 'nerfstudio', 'mrcal', 'foxglove',
+         'autoware', 'vision_pilot', 'ros', 'opencv', 'rays', 'maps', 'urdf', 'tf')
 LENSES = ('radial', 'brown', 'fisheye', 'windscreen', 'shutter', 'stabilised', 'straight')
 # files that no command takes as a drive
 NO_DRIVES = ('.yaml', '.yml', '.json', '.xml', '.txt', '.csv', '.npz')
@@ -334,9 +335,13 @@ COMMANDS = {
             ('--to', {'required': True, 'metavar': 'KIND',
                       'help': f'{", ".join(KINDS[:-1])} or {KINDS[-1]}'}),
             ('--size', {'type': whole_numbers('x', 2, '1280x720'), 'metavar': 'WxH',
-                        'help': 'for pictures that were resized to this'}),
+                        'help': 'for pictures that were resized to this; of a CALIBRATION that '
+                                'does not say the size of its pictures, that size'}),
             ('--crop', {'type': whole_numbers(',', 4, '0,100,1280,520'), 'metavar': 'X,Y,W,H',
                         'help': 'for this part of the pictures'}),
+            ('--nearest', {**FLAG, 'help': 'of a lens that ROS has no model for (omni, double '
+                                           'sphere, EUCM, FOV, division ...), write the nearest '
+                                           'one, and say by how many px it is off'}),
             ('--out', {'type': path_or('omit --out for standard output'), 'metavar': 'FILE',
                        'help': 'default: standard output'}))),
     'check': Command(

@@ -20,6 +20,7 @@ from dashcalib_ros.arrays import Floats, plain_values
 from dashcalib_ros.camera import MODELS, Camera, Radial
 from dashcalib_ros.camera.field import BASIS, Field
 from dashcalib_ros.camera.field import TERMS as FIELD_TERMS
+from dashcalib_ros.camera.other import OtherLens
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Bend, TurnId
 from dashcalib_ros.errors import DashcalibError, InputError, Notice, one_line
@@ -260,6 +261,8 @@ def _read(data: Data, path: Path) -> NamedCamera:
         values, found = data[ros.OWN], opencv.read(data, path)
     else:
         values, found = data, NamedCamera(str(path), _intrinsics(data, path))
+    if isinstance(found, OtherLens):
+        raise unknown_model(found.model, path)
     camera, verdict = found.camera, values.get('verdict')
     sigma = read_sigma(values.get('sigma'), camera)
     return dataclasses.replace(

@@ -217,6 +217,14 @@ class FrameSource(ABC):
         """Return what the user should know, one line each; complete after the last frame."""
         return self.contradictions + self._opening_warnings + self._reading_warnings
 
+    def first_size(self) -> tuple[int, int]:
+        """Return (width, height) of the images as they are stored; reads one where needed."""
+        size = self.stored_size or self.size
+        if size is None:
+            with closing(iter(self)) as frames:
+                size = next(frames).size
+        return size
+
     def stored(self, camera: Camera) -> Camera | None:
         """Return a camera of these images for the pictures as they are stored.
 
