@@ -231,6 +231,9 @@ DRIVE: tuple[Argument, ...] = (
     ('--duration', {'type': MORE_SECONDS, 'metavar': 'S', 'help': 'use S seconds of the drive'}),
     ('--end', {'type': MORE_SECONDS, 'metavar': 'S',
                'help': 'end S seconds after the start of the recording'}),
+    ('--crop', {'type': whole_numbers(',', 4, '0,0,1280,720'), 'metavar': 'X,Y,W,H',
+                'help': 'use this part of the pictures, as of two cameras side by side; the '
+                        'calibration is for it, and so is the mask'}),
     ('--turns', {'type': int, 'metavar': 'N', 'help': 'use N turns'}),
     ('--mask', {'type': Path, 'metavar': 'PNG',
                 'help': 'a picture of the size of the images; its black pixels are not used'}),
@@ -253,8 +256,8 @@ MOTION: tuple[Argument, ...] = (
                                     'default: 0.03; a calibrated gyro has about 0.001'}))
 # what the shell may complete: argcomplete looks for it
 COMPLETED = {'--model': MODELS, '--to': KINDS}
-# a command takes only one of these
-EXCLUSIVE = ('--duration', '--end', '--size', '--crop', '--workers', '--address', '--shard')
+# a command takes only one of each of these
+EXCLUSIVE = (('--duration', '--end'), ('--size', '--crop'), ('--workers', '--address', '--shard'))
 
 
 def out_folder(default: str, cure: str = '') -> Argument:
@@ -401,11 +404,12 @@ def make_parser() -> Parser:
         own = commands.add_parser(
             name, help=command.summary, description=command.description,
             epilog=f'example: {command.example}\n{command.exit_codes}')
-        alone = (own.add_mutually_exclusive_group()
-                 if any(flag in EXCLUSIVE for flag, _ in command.arguments) else own)
+        there = {flag for flag, _ in command.arguments}
+        alone = {flag: group for flags in EXCLUSIVE if there >= set(flags)
+                 for group in [own.add_mutually_exclusive_group()] for flag in flags}
         for flag, options in command.arguments:
             names = ('-o', flag) if flag == '--out' else (flag,)
-            action = (alone if flag in EXCLUSIVE else own).add_argument(*names, **options)
+            action = alone.get(flag, own).add_argument(*names, **options)
             if flag in COMPLETED:
                 action.completer = lambda n=COMPLETED[flag], **_: n  # type: ignore[attr-defined]
     return parser

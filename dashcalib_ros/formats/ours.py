@@ -87,6 +87,7 @@ def result_dict(calibration: CalibrationData) -> dict[str, Any]:
         'straight_lines': c.straight_lines,
         'witnesses': c.witnesses,
         'input': c.input_name,
+        'part': c.part,
         'warnings': c.warnings,
         'warning_codes': codes_of(c.warnings),
         'masked_fraction': None if c.mask is None else 1.0 - float(np.mean(c.mask)),
@@ -161,7 +162,8 @@ def calibration_of(data: Data, camera: Camera | None) -> CalibrationData:
         frames=data.get('frames', 0), reprojection_error_px=data.get('reprojection_error_px'),
         timing=dict(data.get('timing', {})), versions=dict(data.get('versions', {})),
         config=config.replace({'seed': data.get('seed', config.seed)}),
-        input_name=data.get('input', ''), warnings=_notices(data, 'warnings', 'warning_codes'),
+        input_name=data.get('input', ''), part=_frozen(data.get('part')),
+        warnings=_notices(data, 'warnings', 'warning_codes'),
         details=details, covariance=covariance, picture_covariance=of_picture, stored_turns=tuple(
             made(StoredTurnSummary, turn, id=TurnId.stored(place))
             for place, turn in enumerate(data.get('stored_turns', ()))),
@@ -239,6 +241,7 @@ def _provenance(calibration: CalibrationData, created: str | None) -> dict[str, 
         'input': calibration.input_name,
         'seed': calibration.config.seed,
         'versions': calibration.versions,
+        **({} if calibration.part is None else {'part': calibration.part}),
         **({} if calibration.mount is None else {'mount': _mount_dict(calibration.mount)}),
     })
     return block if created is None else {**block, 'created': created}
