@@ -78,19 +78,23 @@ def open_drive(path: Paths, topic: str | None = None, fps: float | None = None,
                start_s: float = 0.0, duration_s: float | None = None, mask: MaskOrPath = None,
                motion: MotionOrPath = None,
                sensor_topics: Mapping[str, str | None] = MappingProxyType({}),
-               crop: Part | None = None) -> Recording:
+               crop: Part | None = None, stamps: str | os.PathLike[str] | None = None,
+               columns: Mapping[str, str] | None = None, sensor_offset_s: float = 0.0
+               ) -> Recording:
     """Open a recorded drive; the parameters are those of calibrate().
 
-    sensor_topics: of a bag, by imu, gps and odom. Raises InputError.
+    sensor_topics: of a bag, by imu, gps and odom. stamps: a list of the times of a folder's
+    images. columns: of a CSV, as read_motion()'s. sensor_offset_s: to add to the stamps of the
+    sensors. Raises InputError.
     """
     valid, paths = mask_of(mask), as_list(path)
-    source = open_frames(paths, topic, fps, start_s, duration_s)
+    source = open_frames(paths, topic, fps, start_s, duration_s, stamps)
     source = source if crop is None else source.cropped(*crop)
     if isinstance(motion, SensorStream):
         return Recording(source, valid, _on_clock_of(source, motion))
-    sensors = drive_motion(paths, motion, sensor_topics, topic)
+    sensors = drive_motion(paths, motion, sensor_topics, topic, columns)
     if sensors is not None:
-        sensors = _on_clock_of(source, sensors)
+        sensors = _on_clock_of(source, sensors.shifted(sensor_offset_s))
         # it counts from the drive's first image, not from the first one that is used
         sensors = sensors if sensors.absolute else sensors.shifted(-start_s)
     return Recording(source, valid, sensors)
@@ -196,10 +200,12 @@ def _feed(taker: Calibrator, drive: Recording, observer: Observer) -> None:
 
 def drive_motion(path: Paths, motion: str | os.PathLike[str] | None = None,
                  chosen: Mapping[str, str | None] = MappingProxyType({}),
-                 topic: str | None = None) -> SensorStream | None:
+                 topic: str | None = None, columns: Mapping[str, str] | None = None
+                 ) -> SensorStream | None:
     """Return the sensors' data of the file motion, else of the bags; None if there is none.
 
-    chosen: the bag's topics by imu, gps and odom; topic: its image topic. Raises InputError for a
+    chosen: the bag's topics by imu, gps and odom; topic: its image topic. columns: of the file, as
+    read_motion()'s. Raises InputError for a
     file of another kind, and for a topic that does not exist.
     """
     wanted = {name: topic for name, topic in chosen.items() if topic is not None}
@@ -207,7 +213,10 @@ def drive_motion(path: Paths, motion: str | os.PathLike[str] | None = None,
         if wanted:
             raise InputError('E-MOTION-TWICE', '--imu, --gps and --odom choose topics of a bag: '
                                                'omit them or --motion')
-        return read_motion(path_of(motion))
+        return read_motion(path_of(motion), columns)
+    if columns:
+        raise InputError('E-COLUMNS-WITHOUT-MOTION', '--columns names those of a CSV: add '
+                                                     '--motion FILE')
     try:
         bags = [each for each in map(Path, as_list(path)) if each.exists() and fits_bag(each)]
         return bag_motion(bags, wanted, topic) if bags else None

@@ -42,6 +42,8 @@ MODELS = ('auto', 'radial', 'brown', 'fisheye')
 KINDS = ('orbslam', 'vins', 'openvins', 'stella', 'svo', 'droid', 'metashape', 'matlab', 'colmap',
          'colmap-db', 'gyroflow', 'kalibr', 'opensfm', 'nerfstudio', 'mrcal', 'foxglove',
          'autoware', 'vision_pilot', 'ros', 'opencv', 'rays', 'maps', 'urdf', 'tf')
+SENSOR_COLUMNS = ('time', 'gyro_x', 'gyro_y', 'gyro_z', 'speed', 'latitude', 'longitude',
+                  'altitude')
 LENSES = ('radial', 'brown', 'fisheye', 'windscreen', 'shutter', 'stabilised', 'straight')
 # files that no command takes as a drive
 NO_DRIVES = ('.yaml', '.yml', '.json', '.xml', '.txt', '.csv', '.npz')
@@ -194,6 +196,22 @@ def count(text: str) -> int:
     return int(text)
 
 
+def _offset(text: str) -> float:
+    """Return the seconds of 3600, 3600s or -1h. Raises ValueError."""
+    unit = {'s': 1.0, 'h': 3600.0}.get(text[-1:], 0.0)
+    return float(text[:-1]) * unit if unit else float(text)
+
+
+def columns(text: str) -> dict[str, str]:
+    """Return the headings of a CSV by our names; a type of argument."""
+    found = dict(part.split('=', 1) for part in text.split(',') if '=' in part)
+    if len(found) != text.count(',') + 1 or set(found) - set(SENSOR_COLUMNS):
+        raise argparse.ArgumentTypeError(
+            f'{text!r} is not like time=t_ms,gyro_x=wx,gyro_y=wy,gyro_z=wz; the names are '
+            f'{", ".join(SENSOR_COLUMNS)}')
+    return {'stamp_s' if name == 'time' else name: theirs for name, theirs in found.items()}
+
+
 SECONDS = number('0 or more seconds, such as 90 or 1:30', lambda value: value >= 0, _seconds)
 MORE_SECONDS = number('more than 0 seconds, such as 90 or 1:30', lambda value: value > 0, _seconds)
 POSITIVE = number('a positive number', lambda value: value > 0)
@@ -226,6 +244,9 @@ DRIVE: tuple[Argument, ...] = (
                   'help': "the video's stream, where it has several: 1, 2 ..."}),
     ('--fps', {'type': POSITIVE, 'metavar': 'F',
                'help': 'images per second of a video or an image folder'}),
+    ('--stamps', {'type': Path, 'metavar': 'FILE',
+                  'help': "a list of the times of a folder's images: a line for each, with or "
+                          'without its name'}),
     ('--start', {'type': SECONDS, 'default': 0.0, 'metavar': 'S',
                  'help': 'skip the first S seconds of the drive; 1:30 is 90'}),
     ('--duration', {'type': MORE_SECONDS, 'metavar': 'S', 'help': 'use S seconds of the drive'}),
@@ -246,8 +267,16 @@ MOTION: tuple[Argument, ...] = (
     ('--motion', {'type': Path, 'metavar': 'FILE',
                   'help': "data of the car's own sensors: a CSV (header: stamp_s, which counts "
                           'from the first image, and any of gyro_x, gyro_y, gyro_z [rad/s], speed '
-                          '[m/s], latitude, longitude, altitude), a GPX file, a KITTI oxts '
-                          'folder, or a video that contains them'}),
+                          '[m/s], latitude, longitude, altitude), a log of Sensor Logger, '
+                          'phyphox, Gyroflow (.gcsv), EuRoC or MARS logger, a GPX file, a KITTI '
+                          'oxts folder, or a video that contains them'}),
+    ('--columns', {'type': columns, 'metavar': 'NAME=COLUMN,...',
+                   'help': 'which columns of the CSV are time, gyro_x, gyro_y, gyro_z, speed, '
+                           'latitude, longitude, altitude; a heading may name its unit (t_ms, '
+                           'wx [deg/s], speed_kmh)'}),
+    ('--sensor-offset', {'type': number('seconds such as 0.5, 3600s or -1h', lambda _: True,
+                                        _offset), 'default': 0.0, 'metavar': 'S',
+                         'help': "added to the sensors' stamps, as --sensor-offset=-3600s"}),
     *((f'--{name}', {'metavar': 'TOPIC',
                      'help': f"the bag's {what} topic, if there are several"})
       for name, what in (('imu', 'Imu'), ('gps', 'NavSatFix'), ('odom', 'Odometry or Twist'))),

@@ -507,3 +507,87 @@ def test_a_car_stood_only_where_its_speed_says_so_all_the_time():
     # odometry that is not wired, and none
     dead = SensorStream(speed=Samples(stamps_s, 0 * speed))
     assert not dead.stood(11.0, 19.0) and not SensorStream().stood(11.0, 19.0)
+
+
+RATES = [(0.1, 0.2, -0.3), (0.2, 0.1, -0.4)]
+EPOCH_NS = 1_700_000_000_000_000_000
+
+
+def rows(start, step, *values, mark=','):
+    """Return 30 lines of a log: its stamps, and the values, which repeat."""
+    return [mark.join(map(str, (start + n * step, *(each(n) for each in values))))
+            for n in range(30)]
+
+
+def rate(axis, scale=1.0):
+    return lambda n: RATES[n % 2][axis] / scale
+
+
+LOGS = {
+    'Gyroscope.csv': ['time,seconds_elapsed,z,y,x', *rows(
+        EPOCH_NS, 10**7, lambda n: n / 100, rate(2), rate(1), rate(0))],
+    'phyphox.csv': ['"Time (s)","Gyroscope x (rad/s)","Gyroscope y (rad/s)",'
+                    '"Gyroscope z (rad/s)","Absolute (rad/s)"', *rows(
+                        0, 0.01, rate(0), rate(1), rate(2), lambda n: 0.4)],
+    'comma.csv': ['"Time (s)"\t"Gyroscope x (rad/s)"\t"Gyroscope y (rad/s)"\t'
+                  '"Gyroscope z (rad/s)"', *(line.replace('.', ',') for line in rows(
+                      0, 0.01, rate(0), rate(1), rate(2), mark='\t'))],
+    'data.csv': ['#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],'
+                 'a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]', *rows(
+                     EPOCH_NS, 10**7, rate(0), rate(1), rate(2), *[lambda n: 9.8] * 3)],
+    'gyro_accel.csv': ['Timestamp[nanosec], gx[rad/s], gy[rad/s], gz[rad/s], ax[m/s^2]', *rows(
+        5 * 10**12, 10**7, rate(0), rate(1), rate(2), lambda n: 9.8)],
+    'fly.gcsv': ['GYROFLOW IMU LOG', 'version,1.3', 'id,logger', 'orientation,YxZ',
+                 'tscale,0.001', 'gscale,0.0001', 'ascale,0.1', 't,gx,gy,gz,ax,ay,az', *rows(
+                     0, 10, rate(0, 1e-4), rate(1, 1e-4), rate(2, 1e-4), *[lambda n: 1] * 3)]}
+
+
+@pytest.mark.parametrize('name', LOGS)
+def test_the_logs_of_phones_and_loggers(tmp_path, name):
+    stream = read_motion(write(tmp_path / name, '\n'.join(LOGS[name])))
+    np.testing.assert_allclose(stream.rate.values[:2], RATES, rtol=1e-9)
+    np.testing.assert_allclose(np.diff(stream.rate.stamps_s), 0.01, atol=1e-6)
+    assert stream.absolute == (name in ('Gyroscope.csv', 'data.csv'))
+    start = {'Gyroscope.csv': 1.7e9, 'data.csv': 1.7e9, 'gyro_accel.csv': 5e3}.get(name, 0.0)
+    assert stream.rate.stamps_s[0] == pytest.approx(start)
+
+
+def test_a_folder_of_sensor_logger_has_gyro_and_gps(tmp_path):
+    write(tmp_path / 'Gyroscope.csv', '\n'.join(LOGS['Gyroscope.csv']))
+    # an accelerometer has the same headings as a gyro
+    write(tmp_path / 'Accelerometer.csv', '\n'.join(LOGS['Gyroscope.csv']))
+    write(tmp_path / 'Location.csv', '\n'.join([
+        'time,seconds_elapsed,speed,altitude,longitude,latitude', *rows(
+            EPOCH_NS, 10**9, lambda n: n, lambda n: 10.0, lambda n: 100.0, lambda n: 8.0,
+            lambda n: 49 + n / 10**4)]))
+    stream = read_motion(tmp_path)
+    assert len(stream.rate.stamps_s) == len(stream.position.stamps_s) == 30
+    np.testing.assert_allclose(stream.speed.values, 10)
+    with pytest.raises(InputError) as raised:
+        read_motion(tmp_path / 'Accelerometer.csv')
+    assert raised.value.code == 'E-MOTION-HEADER'
+
+
+def test_columns_of_any_csv_are_named(tmp_path):
+    path = write(tmp_path / 'a.csv', '\n'.join([
+        't_ms;wx [deg/s];wy [deg/s];wz [deg/s];v_kmh', *rows(
+            0, 10, rate(0, np.pi / 180), rate(1, np.pi / 180), rate(2, np.pi / 180),
+            lambda n: 36, mark=';')]))
+    named = {'stamp_s': 't_ms', 'gyro_x': 'wx [deg/s]', 'gyro_y': 'wy [deg/s]',
+             'gyro_z': 'wz [deg/s]', 'speed': 'v_kmh'}
+    stream = read_motion(path, named)
+    np.testing.assert_allclose(stream.rate.values[:2], RATES)
+    np.testing.assert_allclose(stream.rate.stamps_s[:3], [0, 0.01, 0.02])
+    np.testing.assert_allclose(stream.speed.values, 10)
+    with pytest.raises(InputError) as raised:
+        read_motion(path, {**named, 'gyro_x': 'w'})
+    assert raised.value.code == 'E-MOTION-COLUMNS' and 'wx' in str(raised.value)
+
+
+def test_a_whole_hour_is_told_with_its_option(tmp_path):
+    path = write(tmp_path / 'Gyroscope.csv', '\n'.join(LOGS['Gyroscope.csv']))
+    later = EPOCH_NS + 3600 * 10**9 + 10**8
+    [line] = read_motion(path).on_clock_of(later, True, None).warnings[-1:]
+    assert line.code == 'E-MOTION-OTHER-DAY' and '--sensor-offset=3600s' in line
+    shifted = read_motion(path).shifted(3600.0).on_clock_of(later, True, None)
+    assert 'E-MOTION-OTHER-DAY' not in [each.code for each in shifted.warnings]
