@@ -16,8 +16,10 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.errors import InputError, Notice, one_line, shortened
+from dashcalib_ros.input import novatek
 from dashcalib_ros.input.inputs import is_video
 from dashcalib_ros.input.motion import (
+    DOUBT_S,
     EPOCH_S,
     SAMPLES,
     SensorBuffer,
@@ -317,9 +319,14 @@ def _gpx(text: str, path: Path) -> SensorStream:
 
 
 def _inside_video(path: Path) -> SensorStream:
-    """Read the gyro, and of a GoPro GPS, that a camera has written into its video."""
+    """Read the gyro or GPS that a camera has written into its video."""
     try:
         check_file(path, f'the video {path}')
+        if inside := novatek.fixes(path):
+            rows = np.array(inside)
+            return replace(sensor_stream({'position': (rows[:, 0], rows[:, 1:4]),
+                                          'speed': (rows[:, 0], rows[:, 4:])}, str(path)),
+                           doubt_s=DOUBT_S)
     except OSError as error:
         raise os_error(path, error) from error
     try:

@@ -1,6 +1,7 @@
 """Motion streams from files, bags and live samples."""
 from __future__ import annotations
 
+import struct
 import sys
 import tracemalloc
 from datetime import datetime, timezone
@@ -12,6 +13,7 @@ from made_gopro import gopro
 from refused import refused
 
 from dashcalib_ros.errors import InputError
+from dashcalib_ros.input import novatek
 from dashcalib_ros.input.inputs import open_frames
 from dashcalib_ros.input.motion import (
     DEGREE_M,
@@ -591,3 +593,49 @@ def test_a_whole_hour_is_told_with_its_option(tmp_path):
     assert line.code == 'E-MOTION-OTHER-DAY' and '--sensor-offset=3600s' in line
     shifted = read_motion(path).shifted(3600.0).on_clock_of(later, True, None)
     assert 'E-MOTION-OTHER-DAY' not in [each.code for each in shifted.warnings]
+
+
+def novatek_video(path, place, lost=(0, 1)):
+    """Write an MP4 with the GPS of 30 s, as a Viofo has it; two seconds without a fix."""
+    def box(name, data):
+        return struct.pack('>I4s', 8 + len(data), name) + data
+
+    head, blocks = box(b'ftyp', b'isom' + bytes(4)), []
+    for n in range(30):
+        fix = struct.pack(
+            '<6I4s4f', 10, 59 + (30 + n) // 60 - 1, (30 + n) % 60, 26, 11, 27,
+            b'V\0\0\0' if n in lost else b'ASW\0', 4807.5 + 0.006 * n, 1131.0, 10.0, 90.0)
+        data = b'GPS ' + bytes(place - 12) + fix
+        blocks.append(box(b'free', data + bytes(116 - len(data))))
+    begin = len(head) + 8
+    places = b''.join(struct.pack('>II', begin + 124 * n, 124) for n in range(30))
+    places = box(b'gps ', struct.pack('>II', 0, 30) + places)
+    movie = box(b'moov', box(b'mvhd', bytes(100)) + places)
+    path.write_bytes(head + box(b'mdat', b''.join(blocks)) + movie)
+    return path
+
+
+@pytest.mark.parametrize('place', [16, 48])
+def test_the_gps_of_novatek_s_dashcams(tmp_path, place):
+    stream = read_motion(novatek_video(tmp_path / 'a.mp4', place))
+    # the first fix is of the third second
+    np.testing.assert_allclose(stream.position.stamps_s, range(2, 30))
+    np.testing.assert_allclose(stream.speed.values, 10 * 1852 / 3600, rtol=1e-5)
+    # south of the equator more is farther south: 0.006 minutes a second
+    # as far as 4 bytes tell
+    np.testing.assert_allclose(np.diff(stream.position.values[:, 1]), -0.0001 * 111_320, atol=1)
+    np.testing.assert_allclose(novatek.fixes(tmp_path / 'a.mp4')[0][1:3], (
+        -(48 + 7.512 / 60), -(11 + 31 / 60)), atol=1e-5)
+    assert not stream.absolute and stream.doubt_s > 0
+
+
+def test_a_damaged_video_of_novatek_s_is_read_as_far_as_it_goes(tmp_path):
+    path = novatek_video(tmp_path / 'a.mp4', 48)
+    whole = path.read_bytes()
+    for cut in (20, 100, 2000, len(whole) - 100, len(whole) - 3):
+        path.write_bytes(whole[:cut])
+        novatek.fixes(path)
+    path.write_bytes(whole[:-8] + struct.pack('>II', 2**32 - 1, 2**32 - 1))
+    assert len(novatek.fixes(path)) == 27
+    path.write_bytes(b'')
+    assert novatek.fixes(path) == []
