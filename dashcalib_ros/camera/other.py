@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Lenses that ROS has no model for: their viewing rays, and the nearest camera that it has.
 
 A file's camera is one of these where its model is known and none of models.py is the same. Each is

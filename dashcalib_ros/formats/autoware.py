@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Autoware's: the camera YAML of CalibrationTools, and VisionPilot's H.yaml.
 
 VisionPilot's H maps a pixel to the road: metres ahead and to the left.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The cameras of data sets whose files are JSON, Arrow or Python: only read.
 
 nuScenes, Argoverse 1 and 2 and Cityscapes publish pictures without distortion; of Argoverse's

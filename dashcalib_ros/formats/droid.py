@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """DROID-SLAM's calibration: one line of fx fy cx cy, then OpenCV's coefficients, if any."""
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """KITTI's calib_cam_to_cam.txt, and the calib.txt of its odometry: a name and numbers a line.
 
 A camera has two kinds of pictures, raw and rectified ones, of different sizes; those that are

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """MATLAB's cameraParameters and cameraIntrinsics as JSON: jsonencode(toStruct(parameters)).
 
 It counts pixels from (1, 1), and its older IntrinsicMatrix is the transpose of K.

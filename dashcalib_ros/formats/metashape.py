@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Metashape's calibration XML, and the calibrations in its cameras.xml.
 
 The centre counts from the picture's middle, with the corner of the first pixel at (0, 0); p1 and

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """ORB-SLAM3's settings, and ORB-SLAM2's, which do not say the size of the pictures.
 
 A file for cv2.FileStorage, whose names have dots in them: Camera1.fx.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The camera in stella_vslam's configuration, and in that of OpenVSLAM, its ancestor."""
 from __future__ import annotations
 

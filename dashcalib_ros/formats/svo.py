@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """SVO Pro's camera files, and those of vikit, which SVO has its cameras from."""
 from __future__ import annotations
 

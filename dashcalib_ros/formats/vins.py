@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The camera files of VINS-Fusion and VINS-Mono, which are camodocal's."""
 from __future__ import annotations
 

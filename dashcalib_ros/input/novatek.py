@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The GPS that dashcams with a chip of Novatek (Viofo and many others) write into their MP4.
 
 A box 'gps ' in 'moov' lists places of blocks 'free' 'GPS ', one for each second of the video. A

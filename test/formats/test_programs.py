@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Camera files of SLAM programs and data sets: their own readers, and files as published."""
 from __future__ import annotations
 
