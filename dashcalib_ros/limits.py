@@ -43,8 +43,8 @@ INDEX_BYTES, TOPICS = 2**26, 10_000
 SQLITE_STEPS = 20
 # of a calibration, a configuration or the metadata.yaml of 3000 files
 YAML_BYTES = 2**20
-# of a result.json: it has about 100 kB
-JSON_BYTES = 2**22
+# of a result.json: it has about 100 kB; nuScenes' cameras have 5 MB
+JSON_BYTES = 2**23
 # of a bag's message in JSON: a raw 4K picture; in memory other values take 20 times as much
 JSON_MESSAGE_BYTES = 2**25
 # of a segmentation network: ONNX keeps no larger ones in one file
@@ -67,8 +67,8 @@ LINE = 2**18
 OXTS_BYTES, OXTS_FILES = 2**12, 1_000_000
 # of a table of a fleet's clips, and its rows
 MANIFEST_BYTES, MANIFEST_ROWS = 2**28, 1_000_000
-# of one array of an .npz that may be part of a calibration, and how many an .npz may have
-ARRAY_BYTES, ARRAYS = 4096, 1000
+# of the arrays of an .npz that may be part of a calibration, and how many an .npz may have
+ARRAY_BYTES, ARRAYS = 2**22, 1000
 # px, or a coefficient, of a camera; a rational model's may be thousands
 LENS_NUMBER = 1e7
 # digits of a number in a text: a float has 17 digits and at most 308 zeros

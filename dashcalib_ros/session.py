@@ -35,6 +35,7 @@ from dashcalib_ros.workers.worker import Progress
 
 MaskOrPath = str | os.PathLike[str] | npt.NDArray[Any] | None
 MotionOrPath = str | os.PathLike[str] | SensorStream | None
+Part = tuple[int, int, int, int]
 Settings = Config | Mapping[str, Any] | None
 # s between two looks whether an image has been read
 READING_S = 0.01
@@ -77,18 +78,24 @@ class Checked:
 def open_drive(path: Paths, topic: str | None = None, fps: float | None = None,
                start_s: float = 0.0, duration_s: float | None = None, mask: MaskOrPath = None,
                motion: MotionOrPath = None,
-               sensor_topics: Mapping[str, str | None] = MappingProxyType({})) -> Recording:
+               sensor_topics: Mapping[str, str | None] = MappingProxyType({}),
+               crop: Part | None = None, stamps: str | os.PathLike[str] | None = None,
+               columns: Mapping[str, str] | None = None, sensor_offset_s: float = 0.0
+               ) -> Recording:
     """Open a recorded drive; the parameters are those of calibrate().
 
-    sensor_topics: of a bag, by imu, gps and odom. Raises InputError.
+    sensor_topics: of a bag, by imu, gps and odom. stamps: a list of the times of a folder's
+    images. columns: of a CSV, as read_motion()'s. sensor_offset_s: to add to the stamps of the
+    sensors. Raises InputError.
     """
     valid, paths = mask_of(mask), as_list(path)
-    source = open_frames(paths, topic, fps, start_s, duration_s)
+    source = open_frames(paths, topic, fps, start_s, duration_s, stamps)
+    source = source if crop is None else source.cropped(*crop)
     if isinstance(motion, SensorStream):
         return Recording(source, valid, _on_clock_of(source, motion))
-    sensors = drive_motion(paths, motion, sensor_topics, topic)
+    sensors = drive_motion(paths, motion, sensor_topics, topic, columns)
     if sensors is not None:
-        sensors = _on_clock_of(source, sensors)
+        sensors = _on_clock_of(source, sensors.shifted(sensor_offset_s))
         # it counts from the drive's first image, not from the first one that is used
         sensors = sensors if sensors.absolute else sensors.shifted(-start_s)
     return Recording(source, valid, sensors)
@@ -194,10 +201,12 @@ def _feed(taker: Calibrator, drive: Recording, observer: Observer) -> None:
 
 def drive_motion(path: Paths, motion: str | os.PathLike[str] | None = None,
                  chosen: Mapping[str, str | None] = MappingProxyType({}),
-                 topic: str | None = None) -> SensorStream | None:
+                 topic: str | None = None, columns: Mapping[str, str] | None = None
+                 ) -> SensorStream | None:
     """Return the sensors' data of the file motion, else of the bags; None if there is none.
 
-    chosen: the bag's topics by imu, gps and odom; topic: its image topic. Raises InputError for a
+    chosen: the bag's topics by imu, gps and odom; topic: its image topic. columns: of the file, as
+    read_motion()'s. Raises InputError for a
     file of another kind, and for a topic that does not exist.
     """
     wanted = {name: topic for name, topic in chosen.items() if topic is not None}
@@ -205,7 +214,10 @@ def drive_motion(path: Paths, motion: str | os.PathLike[str] | None = None,
         if wanted:
             raise InputError('E-MOTION-TWICE', '--imu, --gps and --odom choose topics of a bag: '
                                                'omit them or --motion')
-        return read_motion(path_of(motion))
+        return read_motion(path_of(motion), columns)
+    if columns:
+        raise InputError('E-COLUMNS-WITHOUT-MOTION', '--columns names those of a CSV: add '
+                                                     '--motion FILE')
     try:
         bags = [each for each in map(Path, as_list(path)) if each.exists() and fits_bag(each)]
         return bag_motion(bags, wanted, topic) if bags else None
@@ -264,7 +276,13 @@ def with_source(calibration: Calibration, source: FrameSource) -> Calibration:
         new += (Notice(
             'E-PIXELS-STORED', f'for the pictures as they are stored '
             f'({size_text(stored.image_size)}): {values}, and the same distortion'),)
-    return replace(calibration, verdict=verdict, material=material,
+    if source.part is not None:
+        left, top, width, height = source.part
+        new += (Notice(
+            'E-PICTURE-PART', f'for the part {left},{top} to {left + width},{top + height} of the '
+            f'pictures, whose corner is at (0, 0): cut them the same way before use; for whole '
+            f'pictures add {left} to cx and {top} to cy'),)
+    return replace(calibration, verdict=verdict, material=material, part=source.part,
                    input_name=calibration.input_name or source.name,
                    warnings=(*new, *calibration.warnings, *lost))
 
@@ -309,7 +327,7 @@ def calibrate(path: Paths, fps: float | None = None, config: Settings = None,
               topic: str | None = None, start_s: float = 0.0,
               duration_s: float | None = None, mask: MaskOrPath = None,
               progress: Progress | None = None, motion: MotionOrPath = None,
-              model: str | None = None) -> Calibration:
+              model: str | None = None, crop: Part | None = None) -> Calibration:
     """Calibrate a recorded drive.
 
     path: a ROS 2 bag (folder, .mcap, .db3), a ROS 1 .bag, a video, a folder of images, or several
@@ -325,13 +343,15 @@ def calibrate(path: Paths, fps: float | None = None, config: Settings = None,
     motion: data of the car's own sensors: the path of a CSV, a GPX file or a KITTI oxts folder, or
     a stream. None: the topics of the bag, if path is one.
     model: the lens model, over that of config: radial, brown, fisheye, or auto.
+    crop: (x, y, width, height) of the part of the pictures that is used, px, as one of two cameras
+    side by side; the mask is of that part, and so is the camera.
 
     Returns a Calibration: its verdict.level is 'accepted', 'weak' or 'refused', and its camera is
     None if it is refused; accepted() returns it, or raises. Raises InputError for input that
     cannot be read, ConfigError for a bad setting, WorkerError if a child process cannot run.
     """
     settings = _settings(config, model)
-    drive = open_drive(path, topic, fps, start_s, duration_s, mask, motion)
+    drive = open_drive(path, topic, fps, start_s, duration_s, mask, motion, crop=crop)
     with _Progress(progress) as observer:
         return calibrate_drive(drive, settings, observer)
 
@@ -340,7 +360,7 @@ def check(given: Given, path: Paths, fps: float | None = None, config: Settings 
           topic: str | None = None, start_s: float = 0.0,
           duration_s: float | None = None, mask: MaskOrPath = None,
           progress: Progress | None = None, motion: MotionOrPath = None,
-          model: str | None = None) -> Check:
+          model: str | None = None, crop: Part | None = None) -> Check:
     """Check whether a calibration fits a recorded drive.
 
     given: the calibration: a Calibration, what load_camera() returns, the path of a file that it
@@ -357,6 +377,8 @@ def check(given: Given, path: Paths, fps: float | None = None, config: Settings 
     motion: data of the car's own sensors: the path of a CSV, a GPX file or a KITTI oxts folder, or
     a stream. None: the topics of the bag, if path is one.
     model: the lens model, over that of config: radial, brown, fisheye, or auto.
+    crop: (x, y, width, height) of the part of the pictures that is used, px, as one of two cameras
+    side by side; the mask is of that part, and so is the camera.
 
     Returns a Check: its answer is 'right', 'differs' (good enough for the uses in its good_for),
     'wrong' or 'cannot tell', with reasons. Raises InputError for what cannot be read, ConfigError
@@ -364,7 +386,7 @@ def check(given: Given, path: Paths, fps: float | None = None, config: Settings 
     """
     settings = _settings(config, model)
     with in_order(given, path):
-        drive = open_drive(path, topic, fps, start_s, duration_s, mask, motion)
-        named = given_camera(given)
+        drive = open_drive(path, topic, fps, start_s, duration_s, mask, motion, crop=crop)
+        named = given_camera(given, drive.source.first_size)
     with _Progress(progress) as observer:
         return check_drive(drive, named, settings, observer).check

@@ -159,6 +159,9 @@ def inputs(tmp_path_factory):
     # as KITTI writes them: the camera stands
     (place / 'poses.txt').write_text('1 0 0 0 0 1 0 0 0 0 1 0\n' * 12)
     (place / 'settings.yaml').write_text('turns.wanted: 3\n')
+    (place / 'camchain.yaml').write_text(
+        'cam0:\n  camera_model: ds\n  intrinsics: [-0.2, 0.57, 600, 600, 640, 360]\n'
+        '  distortion_model: none\n  distortion_coeffs: []\n  resolution: [1280, 720]\n')
     return place
 
 

@@ -33,7 +33,7 @@ ALLOWED: dict[str, set[str]] = {
 # rooms that nobody but these may import
 BORDERS = {'ros': set(), 'cli': {'__main__'}, 'demo': {'cli'}, 'fleet': {'cli'}}
 HOMES = {'pycolmap': {'reconstruct'}, 'rclpy': {'ros'}, 'onnxruntime': {'detect'},
-         'pyarrow': {'fleet'}}
+         'pyarrow': {'fleet', 'formats'}}
 # what geometry has no use for
 MACHINERY = ('threading', 'multiprocessing', 'subprocess', 'concurrent', 'queue', 'signal', 'os',
              'pathlib', 'shutil', 'tempfile', 'io')

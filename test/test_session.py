@@ -10,7 +10,7 @@ import pytest
 import yaml
 from shared_drive import ONE_TURN, QUICK, SPEC
 
-from dashcalib_ros import calibrate, check, load_camera
+from dashcalib_ros import Calibration, calibrate, check, load_camera
 from dashcalib_ros.cli import main
 
 RATE_HZ = 50.0
@@ -61,3 +61,31 @@ def test_check_of_the_command_and_of_python_say_the_same(folder, command, capsys
     found = check(load_camera(out).camera, folder / 'drive', fps=SPEC.rate, config=QUICK,
                   motion=folder / 'gyro.csv')
     assert (found.answer, list(found.reasons)) == (said['answer'], said['reasons'])
+
+
+def test_a_part_of_the_pictures_is_a_camera_of_its_own(folder, command, tmp_path, capsys):
+    """Two cameras side by side, of which the left one is calibrated."""
+    (tmp_path / 'both').mkdir()
+    for path in (folder / 'drive').iterdir():
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        other = np.full((image.shape[0] + 6, image.shape[1] + 30), 90, np.uint8)
+        other[4:-2, 10:-20] = image
+        cv2.imwrite(str(tmp_path / 'both' / path.name), other)
+    height, width = image.shape
+    arguments = ['--fps', str(SPEC.rate), '--quiet', '--motion', str(folder / 'gyro.csv'),
+                 '--config', str(folder / 'config.yaml'), '--crop', f'10,4,{width},{height}']
+    main(['run', str(tmp_path / 'both'), *arguments, '--out', str(tmp_path / 'out')])
+    result = json.loads((tmp_path / 'out' / 'result.json').read_text())
+    assert result['part'] == [10, 4, width, height] and result['image_size'] == [width, height]
+    assert 'E-PICTURE-PART' in result['warning_codes']
+    assert command['part'] is None and 'E-PICTURE-PART' not in command['warning_codes']
+    for key in ('intrinsics', 'sigma', 'turns', 'verdict'):
+        assert result[key] == command[key]
+    assert Calibration.load(tmp_path / 'out').part == (10, 4, width, height)
+    [file] = (tmp_path / 'out').glob('calibration*.yaml')
+    assert yaml.safe_load(file.read_text().partition('---')[2])['dashcalib']['part'] == [
+        10, 4, width, height]
+    capsys.readouterr()
+    assert main(['run', str(tmp_path / 'both'), '--crop', f'40,0,{width},{height}',
+                 '--out', str(tmp_path / 'none')]) == 2
+    assert 'E-CROP-OUTSIDE' in capsys.readouterr().err

@@ -18,6 +18,8 @@ from dashcalib_ros.camera.camera import Camera
 
 # what moves pixels (n, 2)
 Moved = Callable[[Floats], Floats] | None
+# the viewing rays (n, 3) of pixels (n, 2)
+Rays = Callable[[Floats], Floats] | None
 
 # columns, rows: enough for a smooth field, and as in the benchmarks
 GRID = (25, 15)
@@ -32,10 +34,10 @@ ROTATIONS, PARTS, SETTLED = 50, tuple(0.5**n for n in range(8)), 1e-12
 SAME_PX = 1e-6
 
 
-def grid_of(camera: Camera) -> Floats:
-    """Return (n, 2) pixels spread over the picture."""
-    width, height = camera.image_size
-    u, v = np.meshgrid(np.linspace(0, width - 1, GRID[0]), np.linspace(0, height - 1, GRID[1]))
+def grid_of(camera: Camera, counts: tuple[int, int] = GRID) -> Floats:
+    """Return (n, 2) pixels spread over the picture. counts: of columns and rows."""
+    u, v = np.meshgrid(*(np.linspace(0, side - 1, count)
+                         for side, count in zip(camera.image_size, counts, strict=True)))
     return np.stack([u.ravel(), v.ravel()], -1)
 
 
@@ -173,13 +175,13 @@ def turned(rays: Floats) -> Floats:
     return np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(-1, 3, 3)
 
 
-def as_model(camera: Camera, model: type[Camera], pixels: Floats | None = None) -> Camera:
+def as_model(camera: Camera, model: type[Camera], seen: Rays = None) -> Camera:
     """Return the camera of another model that maps rays most alike; fitted, not exact.
 
-    pixels: (n, 2) where; None: all over the picture.
+    seen: the rays (n, 3) of pixels (n, 2), where they are not the camera's own.
     """
-    pixels = grid_of(camera) if pixels is None else pixels
-    rays = camera.rays(pixels)
+    pixels = grid_of(camera)
+    rays = camera.rays(pixels) if seen is None else seen(pixels)
     known = np.isfinite(rays[:, 0])
     pixels, rays = pixels[known], rays[known]
     start = model.centred(camera.image_size, camera.fx).params

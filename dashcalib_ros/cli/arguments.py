@@ -30,9 +30,9 @@ INPUT_HELP = ('a ROS 2 bag (folder, .mcap, .db3), a ROS 1 .bag, a video, or a fo
 EXIT_HELP = ('exit codes: 0 accepted; 3 weak or refused (the input was fine, the evidence was '
              'not enough); 2 bad input or usage')
 CALIBRATION_HELP = ('result.json (or its folder), calibration.yaml, a file of ROS, OpenCV, '
-                    'Kalibr, COLMAP, nerfstudio, OpenSfM or mrcal, a JSON of fx, fy, cx, cy, k1, '
-                    'k2 ..., width and height, or a bag with camera_info; FILE:NAME for one of '
-                    'several cameras')
+                    'Kalibr, COLMAP, of a SLAM program or a data set (docs/formats.md has all), a '
+                    'JSON of fx, fy, cx, cy, k1, k2 ..., width and height, or a bag with '
+                    'camera_info; FILE:NAME for one of several cameras')
 SHORT_EXIT_HELP = 'exit codes: 0 done; 2 bad input or usage'
 CHECK_EXIT_HELP = ('exit codes: 0 right, or differs but is good enough; 1 wrong; 3 the drive '
                    'cannot tell; 2 bad input or usage')
@@ -40,8 +40,11 @@ BATCH_EXIT_HELP = ('exit codes: 0 every clip was read and no camera was refused;
                    'not be read or a camera was refused; 2 bad manifest or usage')
 # names of models, exports and demos; to take them from their tables would load OpenCV
 MODELS = ('auto', 'radial', 'brown', 'fisheye')
-KINDS = ('colmap', 'gyroflow', 'kalibr', 'opensfm', 'nerfstudio', 'mrcal', 'foxglove', 'ros',
-         'opencv', 'rays', 'maps', 'urdf', 'tf')
+KINDS = ('orbslam', 'vins', 'openvins', 'stella', 'svo', 'droid', 'metashape', 'matlab', 'colmap',
+         'colmap-db', 'gyroflow', 'kalibr', 'opensfm', 'nerfstudio', 'mrcal', 'foxglove',
+         'autoware', 'vision_pilot', 'ros', 'opencv', 'rays', 'maps', 'urdf', 'tf')
+SENSOR_COLUMNS = ('time', 'gyro_x', 'gyro_y', 'gyro_z', 'speed', 'latitude', 'longitude',
+                  'altitude')
 LENSES = ('radial', 'brown', 'fisheye', 'windscreen', 'shutter', 'stabilised', 'straight')
 # files that no command takes as a drive
 NO_DRIVES = ('.yaml', '.yml', '.json', '.xml', '.txt', '.csv', '.npz')
@@ -194,6 +197,22 @@ def count(text: str) -> int:
     return int(text)
 
 
+def _offset(text: str) -> float:
+    """Return the seconds of 3600, 3600s or -1h. Raises ValueError."""
+    unit = {'s': 1.0, 'h': 3600.0}.get(text[-1:], 0.0)
+    return float(text[:-1]) * unit if unit else float(text)
+
+
+def columns(text: str) -> dict[str, str]:
+    """Return the headings of a CSV by our names; a type of argument."""
+    found = dict(part.split('=', 1) for part in text.split(',') if '=' in part)
+    if len(found) != text.count(',') + 1 or set(found) - set(SENSOR_COLUMNS):
+        raise argparse.ArgumentTypeError(
+            f'{text!r} is not like time=t_ms,gyro_x=wx,gyro_y=wy,gyro_z=wz; the names are '
+            f'{", ".join(SENSOR_COLUMNS)}')
+    return {'stamp_s' if name == 'time' else name: theirs for name, theirs in found.items()}
+
+
 SECONDS = number('0 or more seconds, such as 90 or 1:30', lambda value: value >= 0, _seconds)
 MORE_SECONDS = number('more than 0 seconds, such as 90 or 1:30', lambda value: value > 0, _seconds)
 POSITIVE = number('a positive number', lambda value: value > 0)
@@ -226,11 +245,17 @@ DRIVE: tuple[Argument, ...] = (
                   'help': "the video's stream, where it has several: 1, 2 ..."}),
     ('--fps', {'type': POSITIVE, 'metavar': 'F',
                'help': 'images per second of a video or an image folder'}),
+    ('--stamps', {'type': Path, 'metavar': 'FILE',
+                  'help': "a list of the times of a folder's images: a line for each, with or "
+                          'without its name'}),
     ('--start', {'type': SECONDS, 'default': 0.0, 'metavar': 'S',
                  'help': 'skip the first S seconds of the drive; 1:30 is 90'}),
     ('--duration', {'type': MORE_SECONDS, 'metavar': 'S', 'help': 'use S seconds of the drive'}),
     ('--end', {'type': MORE_SECONDS, 'metavar': 'S',
                'help': 'end S seconds after the start of the recording'}),
+    ('--crop', {'type': whole_numbers(',', 4, '0,0,1280,720'), 'metavar': 'X,Y,W,H',
+                'help': 'use this part of the pictures, as of two cameras side by side; the '
+                        'calibration is for it, and so is the mask'}),
     ('--turns', {'type': int, 'metavar': 'N', 'help': 'use N turns'}),
     ('--thorough', {'action': 'store_true', 'default': None,
                     'help': 'use every stretch of the drive beside its turns: a smaller sigma'}),
@@ -248,8 +273,16 @@ MOTION: tuple[Argument, ...] = (
     ('--motion', {'type': Path, 'metavar': 'FILE',
                   'help': "data of the car's own sensors: a CSV (header: stamp_s, which counts "
                           'from the first image, and any of gyro_x, gyro_y, gyro_z [rad/s], speed '
-                          '[m/s], latitude, longitude, altitude), a GPX file, a KITTI oxts '
-                          'folder, or a video that contains them'}),
+                          '[m/s], latitude, longitude, altitude), a log of Sensor Logger, '
+                          'phyphox, Gyroflow (.gcsv), EuRoC or MARS logger, a GPX file, a KITTI '
+                          'oxts folder, or a video that contains them'}),
+    ('--columns', {'type': columns, 'metavar': 'NAME=COLUMN,...',
+                   'help': 'which columns of the CSV are time, gyro_x, gyro_y, gyro_z, speed, '
+                           'latitude, longitude, altitude; a heading may name its unit (t_ms, '
+                           'wx [deg/s], speed_kmh)'}),
+    ('--sensor-offset', {'type': number('seconds such as 0.5, 3600s or -1h', lambda _: True,
+                                        _offset), 'default': 0.0, 'metavar': 'S',
+                         'help': "added to the sensors' stamps, as --sensor-offset=-3600s"}),
     *((f'--{name}', {'metavar': 'TOPIC',
                      'help': f"the bag's {what} topic, if there are several"})
       for name, what in (('imu', 'Imu'), ('gps', 'NavSatFix'), ('odom', 'Odometry or Twist'))),
@@ -258,8 +291,8 @@ MOTION: tuple[Argument, ...] = (
                                     'default: 0.03; a calibrated gyro has about 0.001'}))
 # what the shell may complete: argcomplete looks for it
 COMPLETED = {'--model': MODELS, '--to': KINDS}
-# a command takes only one of these
-EXCLUSIVE = ('--duration', '--end', '--size', '--crop', '--workers', '--address', '--shard')
+# a command takes only one of each of these
+EXCLUSIVE = (('--duration', '--end'), ('--size', '--crop'), ('--workers', '--address', '--shard'))
 
 
 def out_folder(default: str, cure: str = '') -> Argument:
@@ -340,9 +373,13 @@ COMMANDS = {
             ('--to', {'required': True, 'metavar': 'KIND',
                       'help': f'{", ".join(KINDS[:-1])} or {KINDS[-1]}'}),
             ('--size', {'type': whole_numbers('x', 2, '1280x720'), 'metavar': 'WxH',
-                        'help': 'for pictures that were resized to this'}),
+                        'help': 'for pictures that were resized to this; of a CALIBRATION that '
+                                'does not say the size of its pictures, that size'}),
             ('--crop', {'type': whole_numbers(',', 4, '0,100,1280,520'), 'metavar': 'X,Y,W,H',
                         'help': 'for this part of the pictures'}),
+            ('--nearest', {**FLAG, 'help': 'of a lens that ROS has no model for (omni, double '
+                                           'sphere, EUCM, FOV, division ...), write the nearest '
+                                           'one, and say by how many px it is off'}),
             ('--out', {'type': path_or('omit --out for standard output'), 'metavar': 'FILE',
                        'help': 'default: standard output'}))),
     'check': Command(
@@ -402,11 +439,12 @@ def make_parser() -> Parser:
         own = commands.add_parser(
             name, help=command.summary, description=command.description,
             epilog=f'example: {command.example}\n{command.exit_codes}')
-        alone = (own.add_mutually_exclusive_group()
-                 if any(flag in EXCLUSIVE for flag, _ in command.arguments) else own)
+        there = {flag for flag, _ in command.arguments}
+        alone = {flag: group for flags in EXCLUSIVE if there >= set(flags)
+                 for group in [own.add_mutually_exclusive_group()] for flag in flags}
         for flag, options in command.arguments:
             names = ('-o', flag) if flag == '--out' else (flag,)
-            action = (alone if flag in EXCLUSIVE else own).add_argument(*names, **options)
+            action = alone.get(flag, own).add_argument(*names, **options)
             if flag in COMPLETED:
                 action.completer = lambda n=COMPLETED[flag], **_: n  # type: ignore[attr-defined]
     return parser

@@ -16,6 +16,7 @@ from dashcalib_ros.errors import Notice
 from dashcalib_ros.formats import export as exported
 from dashcalib_ros.formats import load_calibration, load_camera
 from dashcalib_ros.formats.export import EXPORTS, check_suffix, cropped, resized
+from dashcalib_ros.formats.load import load_pair
 from dashcalib_ros.input.source import size_text
 from dashcalib_ros.judge.rig import rig_of
 from dashcalib_ros.report import compare as compare_cameras
@@ -30,7 +31,7 @@ def compare(args: argparse.Namespace) -> int:
     """Show how far A differs from B, and for which uses A is good enough."""
     if args.rig:
         return _rig(args)
-    found = compare_cameras(load_camera(args.a), load_camera(args.b))
+    found = compare_cameras(*load_pair(args.a, args.b))
     warn((*found.a.warnings, *found.b.warnings))
     if args.html is not None:
         write_text(args.html, difference_html(found))
@@ -62,10 +63,10 @@ def _rig(args: argparse.Namespace) -> int:
 
 def export(args: argparse.Namespace) -> int:
     """Write the camera to --out, or to standard output."""
-    found = load_camera(args.calibration)
+    found = load_camera(args.calibration, image_size=args.size, nearest=args.nearest)
     warn(found.warnings)
     camera, readout_ms = found.camera, found.readout_ms
-    if args.size is not None:
+    if args.size not in (None, camera.image_size):
         camera = resized(camera, args.size)
     if args.crop is not None:
         whole, camera = camera, cropped(camera, *args.crop)
@@ -99,7 +100,8 @@ def export(args: argparse.Namespace) -> int:
         write_text(args.out, content)
     elif isinstance(content, bytes):
         raise UsageError('E-OUT-NEEDED',
-                         f'--to {args.to} writes a binary file; add --out {args.to}.npz')
+                         f'--to {args.to} writes a binary file; add --out {args.to}'
+                         f'{EXPORTS[args.to].suffixes[0]}')
     else:
         write_stdout(content.rstrip('\n'))
     return ACCEPTED

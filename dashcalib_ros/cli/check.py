@@ -41,9 +41,11 @@ def check(args: argparse.Namespace) -> int:
                              'its pictures; see dashcalib check --help')
         args.input = [str(args.calibration)]
         named = load_with_faults(args.calibration, args.topic)
+        drive = open_drive(args)
     else:
         with in_order(args.calibration, args.input):
-            named = load_with_faults(args.calibration)
+            drive = open_drive(args)
+            named = load_with_faults(args.calibration, size=drive.source.first_size)
     if args.mounting and named.mount is None:
         raise UsageError('E-MOUNT-UNKNOWN',
                          f'{named.name} has no mounting of the camera: use a result.json or '
@@ -55,8 +57,6 @@ def check(args: argparse.Namespace) -> int:
             raise UsageError('E-OUT-WITHOUT-POSES',
                              '--out is for the paths that --poses compares; add --poses FILE')
         check_writable(args.out)
-    with in_order(args.calibration, args.input):
-        drive = open_drive(args)
     with Stages(args.quiet) as stages:
         checked = check_drive(drive, named, config, stages, poses, track, args.verbose)
     found, motion = with_faults(checked.check, named.faults), checked.odometry

@@ -81,4 +81,6 @@ def open_drive(args: argparse.Namespace) -> Recording:
                                                  f'{args.start:g} s')
     topics = {name: getattr(args, name, None) for name in ('imu', 'gps', 'odom')}
     return session.open_drive(args.input, args.topic, args.fps, args.start, duration_s,
-                              args.mask, getattr(args, 'motion', None), topics)
+                              args.mask, getattr(args, 'motion', None), topics, args.crop,
+                              args.stamps, getattr(args, 'columns', None),
+                              getattr(args, 'sensor_offset', 0.0))

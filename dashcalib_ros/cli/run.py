@@ -70,6 +70,9 @@ def _show(args: argparse.Namespace, calibration: Calibration, screen: Screen, wr
 
 def _check_bag(args: argparse.Namespace, source: FrameSource) -> None:
     from dashcalib_ros.input.bag_write import check_bag
+    if source.part is not None:
+        raise InputError('E-BAG-PART', '--write-bag gives a camera_info to whole images: '
+                                       'calibrate without --crop')
     if len(args.input) > 1 or source.name != str(Path(args.input[0])):
         raise InputError('E-BAG-SEVERAL', '--write-bag copies one bag: calibrate with all bags '
                                           'first, then use --write-bag with each bag alone')

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kalibr's camchain.yaml."""
+"""Kalibr's camchain.yaml, and OpenVINS's, which cv2.FileStorage reads."""
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,18 @@ from typing import Any
 import yaml
 
 from dashcalib_ros.camera import NO_DISTORTION, Camera
+from dashcalib_ros.camera.other import (
+    OtherLens,
+    Places,
+    bent,
+    double_sphere,
+    extended_unified,
+    field_of_view,
+    omni,
+    undone,
+)
 from dashcalib_ros.errors import InputError, shortened
+from dashcalib_ros.formats.ros import Indented
 from dashcalib_ros.formats.values import (
     EQUIDISTANT,
     PLUMB_BOB,
@@ -22,10 +34,16 @@ from dashcalib_ros.formats.values import (
     named_coefficients,
     read_numbers,
     read_pair,
+    read_size,
 )
 from dashcalib_ros.judge.difference import NamedCamera
 
 KEY = 'distortion_coeffs'
+PINHOLE, OMNI, DS, EUCM, FOV = 'pinhole', 'omni', 'ds', 'eucm', 'fov'
+# what comes before fx, fy, cx, cy
+FIRST = {PINHOLE: 0, OMNI: 1, DS: 2, EUCM: 2}
+LIFTS: Mapping[str, Callable[..., Places]] = {
+    OMNI: omni, DS: double_sphere, EUCM: extended_unified}
 MODELS = {'radtan': PLUMB_BOB, 'equidistant': EQUIDISTANT, 'equi': EQUIDISTANT,
           **dict.fromkeys(NO_DISTORTION, PLUMB_BOB)}
 
@@ -49,24 +67,52 @@ def results(text: str, path: Path) -> Cameras:
     return {}
 
 
-def _read(data: Data, path: Path) -> Camera:
-    if data.get('camera_model', 'pinhole') != 'pinhole':
+def _read(data: Data, path: Path) -> Camera | OtherLens:
+    model = data.get('camera_model', PINHOLE)
+    if model not in FIRST:
         raise InputError('E-LENS-MODEL',
-                         f'{path} has the camera model {shortened(repr(data["camera_model"]))}; '
+                         f'{path} has the camera model {shortened(repr(model))}; '
                          f'calibrate with --models pinhole-radtan, or pinhole-equi')
-    kind = distortion_model(MODELS, data.get('distortion_model'), 'the distortion model', path)
-    return camera_with(read_pair(data, 'resolution', path),
-                       read_numbers(data.get('intrinsics'), 'intrinsics', path, 4), kind,
-                       read_numbers(data[KEY], KEY, path), path)
+    size, d = read_pair(data, 'resolution', path), read_numbers(data[KEY], KEY, path)
+    values = read_numbers(data.get('intrinsics'), 'intrinsics', path, 4 + FIRST[model])
+    first, view, name = values[:-4], values[-4:], data.get('distortion_model')
+    if model == PINHOLE and name == FOV:
+        return OtherLens(FOV, read_size(*size, path=path), view, field_of_view(*d[:1] or [0.0]))
+    kind = distortion_model(MODELS, name, 'the distortion model', path)
+    if model == PINHOLE:
+        return camera_with(size, view, kind, d, path)
+    if any(d) and kind != PLUMB_BOB:
+        raise InputError('E-LENS-MODEL',
+                         f'{path} has {model} with {name}, which Kalibr does not calibrate; use '
+                         f'its own file')
+    return OtherLens(model, read_size(*size, path=path), view,
+                     undone(bent(d[:2], (d[2], d[3])), LIFTS[model](*first)) if any(d) else
+                     LIFTS[model](*first))
 
 
 def write(found: NamedCamera) -> str:
     """Return a camchain.yaml with one camera. Raises ConfigError."""
+    return str(yaml.safe_dump({'cam0': _content(found)}, sort_keys=False,
+                              default_flow_style=None))
+
+
+def write_openvins(found: NamedCamera) -> str:
+    """Return OpenVINS's kalibr_imucam_chain.yaml, whose T_imu_cam is to be set.
+
+    Raises ConfigError.
+    """
+    pose = [[float(row == column) for column in range(4)] for row in range(4)]
+    content = yaml.dump({'cam0': {'T_imu_cam': pose, **_content(found)}}, Dumper=Indented,
+                        sort_keys=False, default_flow_style=None, width=2**20)
+    return f'%YAML:1.0\n---\n{content}'
+
+
+def _content(found: NamedCamera) -> dict[str, Any]:
     camera = found.camera
-    return str(yaml.safe_dump({'cam0': {
+    return {
         'camera_model': 'pinhole',
         'intrinsics': [camera.fx, camera.fy, camera.cx, camera.cy],
         'distortion_model': 'equidistant' if is_fisheye(camera) else 'radtan',
         'distortion_coeffs': list(named_coefficients(camera, 4, 'kalibr').values()),
         'resolution': list(camera.image_size),
-        'rostopic': '/image_raw'}}, sort_keys=False, default_flow_style=None))
+        'rostopic': '/image_raw'}

@@ -7,20 +7,34 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
 from dataclasses import replace
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.errors import InputError, shortened
+from dashcalib_ros.camera.other import OtherLens
+from dashcalib_ros.camera.other import nearest as nearest_camera
+from dashcalib_ros.errors import InputError, Notice, shortened
 from dashcalib_ros.formats import colmap, ros
 from dashcalib_ros.formats.ours import calibrated_camera
-from dashcalib_ros.formats.plausible import doubts
+from dashcalib_ros.formats.plausible import check_lens, doubts
 from dashcalib_ros.formats.table import FORMATS
-from dashcalib_ros.formats.values import Cameras, Data, numbers_in, said_model
+from dashcalib_ros.formats.values import (
+    Cameras,
+    Data,
+    Read,
+    Size,
+    Sizeless,
+    numbers_in,
+    said_model,
+    xml_root,
+)
 from dashcalib_ros.input.inputs import fits_bag
 from dashcalib_ros.input.source import os_error
 from dashcalib_ros.judge import CalibrationData
@@ -41,40 +55,96 @@ from dashcalib_ros.limits import (
 IN_FOLDER = ('result.json', 'calibration.yaml', 'cameras.bin', 'cameras.txt',
              'sparse/0/cameras.bin', 'sparse/0/cameras.txt', 'camera_models.json',
              'transforms.json')
-KNOWN = ('a result.json (or its folder), a camera_info YAML, a file of OpenCV, Kalibr, COLMAP, '
-         'nerfstudio, OpenSfM, mrcal or Gyroflow, a JSON of fx, fy, cx, cy, k1, k2, width and '
-         'height, or a bag with camera_info')
+KNOWN = ('a result.json (or its folder), a camera_info YAML, a file of OpenCV, Kalibr, COLMAP or '
+         'another program or data set of docs/formats.md, a JSON of fx, fy, cx, cy, k1, k2, width '
+         'and height, or a bag with camera_info')
+# tables of cameras, and rows of one that are read
+TABLES, ROWS = ('.feather', '.parquet'), 1000
 # names that promise a format: there it is worth a correction
 NAMED = ('.json', '.yaml', '.yml')
 Given = CalibrationData | NamedCamera | Camera | str | os.PathLike[str]
 
 
-def load_camera(path: str | os.PathLike[str], name: str | None = None) -> NamedCamera:
+def load_camera(path: str | os.PathLike[str], name: str | None = None,
+                image_size: Size | None = None, nearest: bool = False) -> NamedCamera:
     """Read a camera from a calibration; returns it with its name, and sigma and verdict if known.
 
     path: a result.json (or its folder) or calibration.yaml of this package; a camera_info YAML; a
-    YAML, XML, JSON or .npz with OpenCV's camera matrix and distortion coefficients; Kalibr's
-    camchain; COLMAP's cameras.txt or cameras.bin, or the folder of a model; the JSON of nerfstudio
-    or OpenSfM; mrcal's .cameramodel; Gyroflow's lens profile; a JSON of fx, fy, cx, cy, k1, k2
-    ..., width and height, which may say its "model"; a bag that has camera_info.
-    name: which camera, of a file that has several: as the file names it (cam1, 2), for a bag its
-    image topic or its camera_info topic. FILE:NAME as the path means the same.
+    YAML, XML, JSON or .npz with OpenCV's camera matrix and distortion coefficients; a file of one
+    of the programs and data sets in docs/formats.md; a JSON of fx, fy, cx, cy, k1, k2 ..., width
+    and height, which may say its "model"; a bag that has camera_info.
+    name: which camera, of a file that has several: as the file names it (cam1, 2) or by its
+    number, for a bag its image topic or its camera_info topic. FILE:NAME as the path means the
+    same.
+    image_size: (width, height) of the pictures, for a file that does not say it.
+    nearest: of a lens that none of our models describes, return the nearest one that does; its
+    warnings say by how many px it is off.
 
     Returns a NamedCamera: its `camera` is a Radial, Brown, Rational or Fisheye, in px of the full
     pictures, with the centre of the first pixel at (0, 0). Raises InputError, in one line that
     names the cure, for a file that cannot be read, a lens that none of these describes, and a file
     with several cameras of which none is named.
     """
-    return load_with_faults(path, name).without_faults()
+    return load_with_faults(path, name, lambda: image_size, nearest).without_faults()
 
 
-def load_with_faults(path: str | os.PathLike[str], name: str | None = None) -> NamedCamera:
-    """Read a camera as load_camera() does; what is wrong beside it (R, P) is in its faults."""
-    found = _loaded(path, name)
-    return replace(found, warnings=doubts(found.camera, found.name))
+def load_with_faults(path: str | os.PathLike[str], name: str | None = None,
+                     size: Callable[[], Size | None] = lambda: None, nearest: bool = False
+                     ) -> NamedCamera:
+    """Read a camera as load_camera() does; what is wrong beside it (R, P) is in its faults.
+
+    size: returns image_size; it is called where the file does not say it.
+    """
+    return _checked(*_loaded(path, name), size, nearest)
 
 
-def _loaded(path: str | os.PathLike[str], name: str | None) -> NamedCamera:
+def load_pair(a: str | os.PathLike[str], b: str | os.PathLike[str]
+              ) -> tuple[NamedCamera, NamedCamera]:
+    """Read two cameras of the same pictures, of which one file may omit the pictures' size."""
+    found = [_loaded(path, None) for path in (a, b)]
+    sizes = [read.image_size for _, read in found if not isinstance(read, Sizeless)]
+    first, second = (_checked(label, read, lambda: sizes[0] if sizes else None, False)
+                     .without_faults() for label, read in found)
+    return first, second
+
+
+def _checked(label: str, found: Read, size: Callable[[], Size | None], nearest: bool
+             ) -> NamedCamera:
+    """Return a camera with its warnings. label: its file and name."""
+    if isinstance(found, Sizeless):
+        known = size()
+        if known is None:
+            raise InputError('E-CALIBRATION-NO-SIZE',
+                             f'{label} has no size of the pictures; {found.cure}')
+        found = found.of(known)
+    notices: tuple[Notice, ...] = ()
+    if isinstance(found, OtherLens):
+        if not nearest:
+            raise InputError('E-LENS-MODEL',
+                             f'{label} has the lens model {found.model!r}, which ROS has not; '
+                             f'write the nearest one with dashcalib export '
+                             f'{shlex.quote(label)} --nearest --to ros')
+        found, notices = _nearest(label, found)
+    if isinstance(found, Camera):
+        found = NamedCamera(label, found)
+    return replace(found, warnings=(*notices, *doubts(found.camera, found.name)))
+
+
+def _nearest(label: str, lens: OtherLens) -> tuple[Camera, tuple[Notice, ...]]:
+    """Return the camera that is nearest to a lens, and by how much it is off."""
+    found = nearest_camera(lens)
+    check_lens(found.camera, label)
+    unseen = (f'; the lens has no ray for {100 * found.unseen:.0f} % of the picture'
+              if found.unseen else '')
+    return found.camera, (Notice(
+        'E-LENS-NEAREST',
+        f'{label} has the lens model {lens.model!r}: the nearest one of ROS, '
+        f'{found.camera.ros_model}, is off by {found.rms_px:.2g} px RMS over the picture and '
+        f'{found.worst_px:.2g} px at the worst, at {found.worst_at}{unseen}'),)
+
+
+def _loaded(path: str | os.PathLike[str], name: str | None) -> tuple[str, Read]:
+    """Return the camera that a file has, and what it is called in messages."""
     text = str(path_of(path))
     before, _, after = text.rpartition(':')
     # lexists() takes any text, also one that is too long for a name
@@ -82,8 +152,11 @@ def _loaded(path: str | os.PathLike[str], name: str | None) -> NamedCamera:
         text, name = before, after
     place = Path(text)
     try:
+        if place.suffix == '.db':
+            return _chosen(colmap.database_cameras(place), name, place)
         if fits_bag(place):
-            return ros.camera_of_bag(place, name)
+            found = ros.camera_of_bag(place, name)
+            return found.name, found
         if place.is_dir():
             inside = [place / each for each in IN_FOLDER if (place / each).exists()]
             if not inside:
@@ -92,20 +165,25 @@ def _loaded(path: str | os.PathLike[str], name: str | None) -> NamedCamera:
             place = inside[0]
         if place.suffix == '.npz':
             return _chosen(_cameras_in(_arrays(place), place), name, place)
+        if place.suffix in TABLES:
+            return _chosen(_cameras_in(_table(place), place), name, place)
         if place.suffix == '.bin':
             return _chosen(colmap.binary_cameras(place), name, place)
-        return parse_camera(read_text(place, JSON_BYTES), place, name)
+        return _chosen(_text_cameras(read_text(place, JSON_BYTES), place), name, place)
     except OSError as error:
         raise os_error(place, error) from error
 
 
 def parse_camera(text: str, path: str | Path, name: str | None = None) -> NamedCamera:
     """Read a camera from a calibration's text; path is for messages only. See load_camera()."""
-    place = Path(path)
+    return _checked(*_chosen(_text_cameras(text, Path(path)), name, path), lambda: None, False)
+
+
+def _text_cameras(text: str, place: Path) -> Cameras:
     for form in FORMATS.values():
         if form.in_text and (found := form.in_text(text, place)):
-            return _chosen(found, name, path)
-    return _chosen(_cameras_in(_decoded(text, place), place), name, path)
+            return found
+    return _cameras_in(_decoded(text, place), place)
 
 
 def _cameras_in(data: Any, path: Path) -> Cameras:
@@ -122,13 +200,16 @@ def _unknown(path: Path, model: str | None = None) -> InputError:
                       f'{path} is not a known camera calibration{said}; use {KNOWN}')
 
 
-def _chosen(cameras: Cameras, name: str | None, path: str | Path) -> NamedCamera:
+def _chosen(cameras: Cameras, name: str | None, path: str | Path) -> tuple[str, Read]:
+    """Return the camera of a name, and what it is called in messages."""
     if name is None and len(cameras) == 1:
         name = next(iter(cameras))
+    if name is not None and name not in cameras and name.isdecimal():
+        numbered = [each for each in cameras if re.findall(r'\d+', each)[-1:]
+                    and int(re.findall(r'\d+', each)[-1]) == int(name)]
+        name = numbered[0] if len(numbered) == 1 else name
     if name is not None and name in cameras:
-        found = cameras[name]()
-        return found if isinstance(found, NamedCamera) else NamedCamera(
-            f'{path}:{name}' if len(cameras) > 1 else str(path), found)
+        return f'{path}:{name}' if len(cameras) > 1 else str(path), cameras[name]()
     there = shortened(', '.join(cameras)) or 'one camera without a name'
     if name is not None:
         raise InputError('E-CAMERA-NAME',
@@ -142,7 +223,7 @@ def _decoded(text: str, path: Path) -> Any:
     """Return what a text of XML, JSON or YAML has. Raises InputError."""
     start = text.lstrip()[:1]
     if start == '<':
-        return _xml(text, path)
+        return _element(xml_root(text, path))
     try:
         return (parse_json(text, str(path)) if start in ('{', '[')
                 else parse_yaml(_first_document(text), str(path)))
@@ -163,17 +244,6 @@ def _first_document(text: str) -> str:
     return next((each for each in documents if re.sub(r'#[^\n]*', '', each).strip()), '')
 
 
-def _xml(text: str, path: Path) -> Any:
-    """Return the content of OpenCV's XML. It has no declarations, which could be made to grow."""
-    try:
-        if '<!DOCTYPE' in text or '<!ENTITY' in text:
-            raise ElementTree.ParseError('declarations')
-        return _element(ElementTree.fromstring(text))
-    except (ElementTree.ParseError, RecursionError, ValueError) as error:
-        raise InputError('E-CALIBRATION-XML',
-                         f'{path} is no XML that can be read; use {KNOWN}') from error
-
-
 def _element(node: ElementTree.Element) -> Any:
     if len(node):
         return {child.tag: _element(child) for child in node}
@@ -191,8 +261,11 @@ def _arrays(path: Path) -> Data:
         with path.open('rb') as file:
             check_npz(file, ARRAYS)
             with np.load(file, allow_pickle=False) as arrays:
-                small = [info.filename.removesuffix('.npy') for info in arrays.zip.infolist()
-                         if info.file_size <= ARRAY_BYTES]
+                sizes = sorted((info.file_size, info.filename.removesuffix('.npy'))
+                               for info in arrays.zip.infolist())
+                small = [name for (_, name), total in zip(
+                    sizes, accumulate(size for size, _ in sizes), strict=True)
+                    if total <= ARRAY_BYTES]
                 return {name: arrays[name].tolist() for name in small}
     except InputError:
         raise
@@ -201,9 +274,27 @@ def _arrays(path: Path) -> Data:
                          f'{path} is no .npz that can be read; write it again') from error
 
 
-def given_camera(given: Given) -> NamedCamera:
+def _table(path: Path) -> list[Data]:
+    """Return the rows of an Arrow file or a Parquet file, as data sets have them."""
+    check_file(path, limit=JSON_BYTES)
+    try:
+        from pyarrow import feather, parquet
+    except ImportError as error:
+        raise InputError('E-CALIBRATION-ARROW',
+                         f"{path} needs pyarrow: pip install '.[fleet]' in the folder of this "
+                         f'package') from error
+    try:
+        table = (feather if path.suffix == TABLES[0] else parquet).read_table(str(path))
+        return list(table.slice(0, ROWS).to_pylist())
+    except Exception as error:  # a damaged file makes Arrow raise nearly anything
+        raise InputError('E-CALIBRATION-TABLE',
+                         f'{path} is no table that can be read; copy it again') from error
+
+
+def given_camera(given: Given, size: Callable[[], Size | None] = lambda: None) -> NamedCamera:
     """Return the camera of a calibration: a result, a file as for load_camera(), or a camera.
 
+    size: returns that of the pictures, for a file that does not say it.
     Raises InputError for a refused result, a file that cannot be read, and any other object.
     """
     if isinstance(given, NamedCamera):
@@ -213,6 +304,6 @@ def given_camera(given: Given) -> NamedCamera:
     if isinstance(given, Camera):
         return NamedCamera(f'the {given.model} camera', given)
     if isinstance(given, (str, os.PathLike)):
-        return load_camera(given)
+        return load_with_faults(given, size=size).without_faults()
     raise InputError('E-CALIBRATION-TYPE', f'a calibration cannot be {shortened(repr(given))}: '
                                            f'pass a Calibration, a camera, or the path of a file')

@@ -14,6 +14,8 @@ import cv2
 import numpy as np
 
 from dashcalib_ros.camera import NO_DISTORTION, ros_faults
+from dashcalib_ros.camera.other import OtherLens, plane, undone
+from dashcalib_ros.camera.other import opencv as distortion
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.formats.values import (
     EQUIDISTANT,
@@ -29,6 +31,7 @@ from dashcalib_ros.formats.values import (
     plain_key,
     read_matrix,
     read_numbers,
+    read_size,
 )
 from dashcalib_ros.judge.difference import NamedCamera
 
@@ -48,6 +51,8 @@ WIDTHS, HEIGHTS = (tuple(f'{start}{end}' for end in ends for start in (
     ('width', 'w', 'cols', 'x'), ('height', 'h', 'rows', 'y')))
 RECTIFICATION = ('rectificationmatrix', 'rectification')
 PROJECTION = ('projectionmatrix', 'projection')
+# coefficients of a lens with thin prisms, without and with a tilted sensor
+PRISMS = (12, 14)
 
 
 class Entries:
@@ -89,7 +94,7 @@ def cameras(data: Any, path: Path) -> Cameras:
 
 
 def read(data: Data, path: Path, rectification: Sequence[str] = RECTIFICATION,
-         projection: Sequence[str] = PROJECTION) -> NamedCamera:
+         projection: Sequence[str] = PROJECTION) -> NamedCamera | OtherLens:
     """Return the camera of a camera matrix and distortion coefficients.
 
     rectification, projection: the names of ROS's R and P. Raises InputError.
@@ -116,6 +121,9 @@ def read(data: Data, path: Path, rectification: Sequence[str] = RECTIFICATION,
                              f'fisheye; add a line distortion_model: {PLUMB_BOB}, or '
                              f'{EQUIDISTANT}')
         kind = EQUIDISTANT if fisheye else PLUMB_BOB if len(d) <= 5 else RATIONAL
+    if len(d) in PRISMS and any(d[8:]) and kind in (PLUMB_BOB, RATIONAL):
+        return OtherLens('thin prisms', read_size(*size, path=path), focal_and_centre(k),
+                         undone(distortion(d), plane))
     camera = camera_with(size, focal_and_centre(k), str(kind), d, path)
     return NamedCamera(str(path), camera, faults=ros_faults(camera, k, r, p))
 

@@ -21,6 +21,7 @@ from dashcalib_ros.arrays import Floats, plain_values
 from dashcalib_ros.camera import MODELS, Camera, Radial
 from dashcalib_ros.camera.field import BASIS, Field
 from dashcalib_ros.camera.field import TERMS as FIELD_TERMS
+from dashcalib_ros.camera.other import OtherLens
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Bend, TurnId
 from dashcalib_ros.errors import DashcalibError, InputError, Notice, one_line
@@ -89,6 +90,7 @@ def result_dict(calibration: CalibrationData) -> dict[str, Any]:
         'witnesses': c.witnesses,
         'known': c.known,
         'input': c.input_name,
+        'part': c.part,
         'warnings': c.warnings,
         'warning_codes': codes_of(c.warnings),
         'masked_fraction': None if c.mask is None else 1.0 - float(np.mean(c.mask)),
@@ -163,7 +165,8 @@ def calibration_of(data: Data, camera: Camera | None) -> CalibrationData:
         frames=data.get('frames', 0), reprojection_error_px=data.get('reprojection_error_px'),
         timing=dict(data.get('timing', {})), versions=dict(data.get('versions', {})),
         config=config.replace({'seed': data.get('seed', config.seed)}),
-        input_name=data.get('input', ''), warnings=_notices(data, 'warnings', 'warning_codes'),
+        input_name=data.get('input', ''), part=_frozen(data.get('part')),
+        warnings=_notices(data, 'warnings', 'warning_codes'),
         details=details, covariance=covariance, picture_covariance=of_picture, stored_turns=tuple(
             made(StoredTurnSummary, turn, id=TurnId.stored(place))
             for place, turn in enumerate(data.get('stored_turns', ()))),
@@ -242,6 +245,7 @@ def _provenance(calibration: CalibrationData, created: str | None) -> dict[str, 
         'input': calibration.input_name,
         'seed': calibration.config.seed,
         'versions': calibration.versions,
+        **({} if calibration.part is None else {'part': calibration.part}),
         **({} if calibration.mount is None else {'mount': _mount_dict(calibration.mount)}),
     })
     return block if created is None else {**block, 'created': created}
@@ -264,6 +268,8 @@ def _read(data: Data, path: Path) -> NamedCamera:
         values, found = data[ros.OWN], opencv.read(data, path)
     else:
         values, found = data, NamedCamera(str(path), _intrinsics(data, path))
+    if isinstance(found, OtherLens):
+        raise unknown_model(found.model, path)
     camera, verdict = found.camera, values.get('verdict')
     sigma = read_sigma(values.get('sigma'), camera)
     return dataclasses.replace(

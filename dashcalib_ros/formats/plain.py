@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from dashcalib_ros.camera import FISHEYE, MODELS, NO_DISTORTION, Radial
+from dashcalib_ros.camera.other import OtherLens
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.formats import opencv
 from dashcalib_ros.formats.values import (
@@ -51,7 +52,7 @@ def _has_view(data: Any) -> bool:
     return isinstance(data, dict) and opencv.Entries(data, Path()).key(*VIEW[0]) is not None
 
 
-def _read(data: Data, path: Path) -> NamedCamera:
+def _read(data: Data, path: Path) -> NamedCamera | OtherLens:
     """Return the camera; coefficients after k2 may be omitted."""
     entries = opencv.Entries(data, path)
     view = [read_number(data, entries.key(*names) or names[0], path) for names in VIEW]

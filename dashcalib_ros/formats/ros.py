@@ -18,6 +18,7 @@ import numpy as np
 import yaml
 
 from dashcalib_ros.camera import Camera, ros_camera, ros_faults
+from dashcalib_ros.camera.other import OtherLens
 from dashcalib_ros.camera.remap import SAME
 from dashcalib_ros.errors import ConfigError, InputError, shortened
 from dashcalib_ros.formats import opencv, plain
@@ -74,7 +75,7 @@ def echoed_cameras(data: Any, path: Path) -> Cameras:
     return {'': partial(_read_echoed, data, path)} if known else {}
 
 
-def _read_echoed(data: Data, path: Path) -> NamedCamera:
+def _read_echoed(data: Data, path: Path) -> NamedCamera | OtherLens:
     entries = opencv.Entries(data, path)
     part = entries.first('roi')
     part = part if isinstance(part, dict) else {}
@@ -163,7 +164,7 @@ def yaml_text(content: Mapping[str, Any]) -> str:
     name = content.get('camera_name')
     if isinstance(name, str) and not name.isidentifier():  # OpenCV: 4k is a broken number
         own['camera_name'] = _Text(name)
-    return str(yaml.dump({**content, **own}, Dumper=_Dumper, sort_keys=False,
+    return str(yaml.dump({**content, **own}, Dumper=Indented, sort_keys=False,
                          default_flow_style=None, width=2**20, allow_unicode=True,
                          version=(1, 2)))
 
@@ -183,14 +184,15 @@ class _Text(str):
     """A text that is written with quotes."""
 
 
-class _Dumper(yaml.SafeDumper):
+class Indented(yaml.SafeDumper):
     """Writes plain values, texts with quotes, and lists that are indented."""
 
     def increase_indent(self, flow: bool = False, indentless: bool = False) -> None:
+        """Indent a list below its key, too."""
         super().increase_indent(flow, False)
 
 
-_Dumper.add_representer(_Text, lambda dumper, text: dumper.represent_scalar(
+Indented.add_representer(_Text, lambda dumper, text: dumper.represent_scalar(
     'tag:yaml.org,2002:str', str(text), style='"'))
 
 

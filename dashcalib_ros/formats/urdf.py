@@ -24,7 +24,7 @@ def write(found: NamedCamera) -> str:
 
     Raises ConfigError where the mounting is not known.
     """
-    mount, name = _mount_of(found), _frame_name(found.name)
+    mount, name = mount_of(found), _frame_name(found.name)
     about = [
         f'{found.name}: how the camera sits on the car, {mount.verdict}', *mount.reasons,
         *(f'{what}: {_with_sigma(mount, key)}' for key, what in WRITTEN.items()),
@@ -58,7 +58,7 @@ def write_transform(found: NamedCamera) -> str:
     Without a known height it has none, which a comment before it says. Raises ConfigError where
     the mounting is not known.
     """
-    mount = _mount_of(found)
+    mount = mount_of(found)
     turn = ' '.join(f'--q{axis} {_number(value)}'
                     for axis, value in zip('xyzw', mount.quaternion, strict=True))
     known = mount.height_m is not None
@@ -68,7 +68,8 @@ def write_transform(found: NamedCamera) -> str:
             f'--frame-id {BASE} --child-frame-id {_frame_name(found.name)}_optical_frame\n')
 
 
-def _mount_of(found: NamedCamera) -> Mount:
+def mount_of(found: NamedCamera) -> Mount:
+    """Return the mounting. Raises ConfigError where it is not known."""
     if found.mount is None:
         raise ConfigError('E-EXPORT-NO-MOUNTING',
                           f'{found.name} does not say how the camera sits on the car; calibrate a '

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import math
 import re
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from dashcalib_ros.camera import (
@@ -21,15 +23,31 @@ from dashcalib_ros.camera import (
     Rational,
     camera_from_ros,
 )
+from dashcalib_ros.camera.other import OtherLens
 from dashcalib_ros.errors import ConfigError, InputError, shortened
 from dashcalib_ros.formats.plausible import check_focal, check_lens
 from dashcalib_ros.judge.difference import NamedCamera
 from dashcalib_ros.limits import SIDE, check_pixels
 
 Data = Mapping[str, Any]
+Size = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Sizeless:
+    """A camera of a file that does not say the size of its pictures.
+
+    of: returns it for pictures of (width, height). cure: where nobody knows their size.
+    """
+
+    of: Callable[[Size], Camera | NamedCamera | OtherLens]
+    cure: str = 'write their size with --size WxH'
+
+
+Read = Camera | NamedCamera | OtherLens | Sizeless
 # the cameras of a file by their names, each as the function that reads it; one that returns a
 # Camera has nothing else to say
-Cameras = Mapping[str, Callable[[], Camera | NamedCamera]]
+Cameras = Mapping[str, Callable[[], Read]]
 
 # ROS's distortion models; RATIONAL has all pinholes in it
 ROS_MODELS = PLUMB_BOB, RATIONAL, EQUIDISTANT = (
@@ -66,6 +84,11 @@ def camera_with(size: Sequence[Any], view: Sequence[float], kind: str, d: Sequen
         _check_count(d, path)
     check_lens(camera, path)
     return camera
+
+
+def pinhole(k: Sequence[float], path: object) -> Sizeless:
+    """Return the camera of K (9,), of pictures without distortion whose size is not written."""
+    return Sizeless(lambda size: camera_with(size, focal_and_centre(k), PLUMB_BOB, (), path))
 
 
 def _check_count(d: Sequence[float], path: object) -> None:
@@ -123,6 +146,15 @@ def named_coefficients(camera: Camera, most: int, program: str) -> dict[str, flo
                           f'{program} has no {", ".join(more)}; calibrate with --model radial, or '
                           f'export to opencv')
     return dict(list(named.items())[:most])
+
+
+def pinhole_only(camera: Camera, program: str) -> Camera:
+    """Return the camera. Raises ConfigError for a fisheye, for a program that has not ours."""
+    if is_fisheye(camera):
+        raise ConfigError('E-EXPORT-LENS',
+                          f'{program} has no fisheye such as ours; export to maps, and use the '
+                          f'rectified pictures')
+    return camera
 
 
 def is_fisheye(camera: Camera) -> bool:
@@ -236,6 +268,17 @@ def read_numbers(value: Any, what: str, path: object, *counts: int) -> list[floa
         raise InputError('E-CALIBRATION-COUNT',
                          f'{path}: {what} must have {counts[-1]} numbers, and has {len(found)}')
     return found
+
+
+def xml_root(text: str, path: object) -> ElementTree.Element:
+    """Return the root of an XML text without declarations, which could be made to grow."""
+    try:
+        if '<!DOCTYPE' in text or '<!ENTITY' in text:
+            raise ElementTree.ParseError('declarations')
+        return ElementTree.fromstring(text)
+    except (ElementTree.ParseError, RecursionError, ValueError) as error:
+        raise InputError('E-CALIBRATION-XML',
+                         f'{path} is no XML that can be read; write it again') from error
 
 
 def numbers_in(text: str) -> list[float] | None:

@@ -154,7 +154,7 @@ _SIZES = '''
     total(octet_length(name) + octet_length(type)) FROM topics) FROM messages'''
 
 
-def _limited(database: apsw.Connection) -> None:
+def limited(database: apsw.Connection) -> None:
     """Let a database give what is stored in its tables, and its queries end.
 
     Raises apsw.Error where there is more, here and in its queries.
@@ -173,7 +173,7 @@ def _limited(database: apsw.Connection) -> None:
 
 def _whole(database: apsw.Connection) -> None:
     """Limit a database that is to be read by its index; raises apsw.Error also for damage."""
-    _limited(database)
+    limited(database)
     size = Path(database.filename).stat().st_size
     [(contents, topics, names)] = database.execute(_SIZES)
     if max(contents, names) > size or topics > TOPICS:
@@ -794,7 +794,7 @@ def scan_db3(path: Path, damage: Damage) -> Iterator[Record]:
     try:
         # else SQLite refuses a file that is shorter than its header says
         database.execute('PRAGMA writable_schema = ON')
-        _limited(database)
+        limited(database)
         topics = {key: (str(name), str(kind or '')) for key, name, kind in
                   islice(database.execute('SELECT id, name, type FROM topics'), TOPICS)}
         try:

@@ -40,6 +40,7 @@ from dashcalib_ros.input.times import (
     paired,
     rising,
     stamps_in,
+    unit_of,
 )
 from dashcalib_ros.limits import (
     CLIP_FILES,
@@ -61,7 +62,9 @@ class FolderSource(FrameSource):
     Raises InputError for a folder without images.
     """
 
-    def __init__(self, path: Path, topic: str | None = None, fps: float | None = None) -> None:
+    def __init__(self, path: Path, topic: str | None = None, fps: float | None = None,
+                 stamps: Path | None = None) -> None:
+        """stamps: the list of the times; None: one in the folder or beside it."""
         names = [entry.name for entry in path.iterdir()]
         images = sorted(filter(_is_image, names), key=by_name)
         self._path = path
@@ -71,7 +74,7 @@ class FolderSource(FrameSource):
             raise InputError('E-INPUT-SEVERAL-CAMERAS', f'{path} has images of {cameras} cameras '
                              f'({first_of(images)}): put the images of one camera into a '
                              f'separate folder')
-        times = times_of(path, images, fps)
+        times = times_of(path, images, fps, stamps)
         self._names, self._stamps_ns = times.names, times.stamps_ns
         self._begin_s, self.recorded = times.begin_s, times.recorded
         warnings = list(times.notices)
@@ -142,11 +145,20 @@ class Times:
     notices: tuple[Notice, ...] = ()
 
 
-def times_of(path: Path, names: Sequence[str], fps: float | None) -> Times:
-    """Return the times of a folder's images. names: in their order; fps: that was given, in Hz."""
+def times_of(path: Path, names: Sequence[str], fps: float | None, stamps: Path | None = None
+             ) -> Times:
+    """Return the times of a folder's images.
+
+    names: in their order; fps: that was given, in Hz; stamps: the list to use. Raises InputError
+    where its times cannot be assigned.
+    """
     stems = [Path(name).stem for name in names]
-    listed, unused = _listed(path, names, stems)
-    if listed is not None and listed.by_name:
+    listed, unused = _listed(path, names, stems, stamps)
+    if stamps is not None and listed is None:
+        raise InputError('E-STAMPS-UNUSED', f'{stamps}: its times cannot be assigned to the '
+                         f'{len(names)} images of {path}: write a line for each image, its name '
+                         f'and its time in seconds')
+    if listed is not None and (listed.by_name or stamps is not None):
         return _recorded(path, names, listed.stamps_ns, f'those in {listed.file.name}',
                          listed.file.name, fps)
     named = stamps_in(stems)
@@ -243,10 +255,8 @@ TIMES, OTHERS = (re.compile(words, re.IGNORECASE) for words in (
     r'time|stamp|^(?:data|frames?|images?|rgb|color|colour)$',
     r'imu|gps|gnss|oxts|lidar|velo|depth|odom|pose|radar|events?|ground'))
 SUFFIXES = frozenset(('.txt', '.csv', '.tsv', '.times', '.timestamps'))
-# headings of columns: times with their unit, and what an image is counted by
+# headings of columns: times, and what an image is counted by
 TIME_HEADING = re.compile(r'time|stamp|^t$|^sec|^ns', re.IGNORECASE)
-UNIT_HEADINGS = {'nanoseconds': r'ns|nsecs?|nano\w*', 'microseconds': r'us|µs|usecs?|micro\w*',
-                 'milliseconds': r'ms|msecs?|milli\w*', 'seconds': r's|secs?|seconds?'}
 COUNT_HEADING = re.compile(r'^(?:index|idx|id|no|nr|#|n|frame\w*|image\w*|number|count\w*|seq)$',
                            re.IGNORECASE)
 NUMBER = re.compile(r'[-+]?\d*[.,]?\d+(?:e[-+]?\d{1,3})?|\d+\.', re.IGNORECASE)
@@ -263,25 +273,29 @@ class _List:
     by_name: bool
 
 
-def _listed(path: Path, names: Sequence[str], stems: Sequence[str]
+def _listed(path: Path, names: Sequence[str], stems: Sequence[str], given: Path | None = None
             ) -> tuple[_List | None, list[str]]:
     """Return the list of the images' times, in or beside their folder, and those of no use.
 
-    One that names the images comes before one that has a line for each.
+    given: the only one to look at, whatever its name. One that names the images comes before one
+    that has a line for each.
     """
     unused: list[str] = []
     found: list[_List] = []
     numbers = numbers_in(stems)
-    for file in islice(_candidates(path), LISTS):
-        if OTHERS.search(file.stem):
+    for file in islice(_candidates(path), LISTS) if given is None else (given,):
+        if given is None and OTHERS.search(file.stem):
             continue
         try:
             table = _Table([_cells(line) for line in
                             islice(read_lines(file, LIST_BYTES), CLIP_FILES)])
         except InputError:
+            if given is not None:
+                raise
             continue
         naming = table.naming(names, stems, path.name)
-        is_times = bool(TIMES.search(file.stem)) or file.stem == path.name
+        is_times = (bool(TIMES.search(file.stem)) or file.stem == path.name
+                    or given is not None)
         if len(table.filled) < 2 or not (is_times or naming):
             continue
         stamps_ns = table.stamps(naming, numbers, is_times)
@@ -367,7 +381,7 @@ class _Table:
                 continue
             if not headed and [*map(_whole, values)] == [*numbers]:
                 continue
-            read = in_ns(values, _unit(self.heading[column]) if headed else
+            read = in_ns(values, unit_of(self.heading[column]) if headed else
                          'seconds' if dated(self.filled[0][column]) else '')
             stamps_ns = None if read is None else (
                 [None if line is None else read.ns[line] for line in naming] if naming
@@ -388,13 +402,6 @@ class _Table:
             if len(line_of) == len(self.filled) and set(numbers) <= line_of.keys():
                 return [lines[line_of[number]] for number in numbers if number is not None]
         return paired(numbers, lines)
-
-
-def _unit(heading: str) -> str:
-    """Return the unit that a heading names, such as 'timestamp [ns]' or stamp_s; '' for none."""
-    words = re.findall(r'[a-zµ]+', heading.lower())
-    return next((unit for unit, like in UNIT_HEADINGS.items()
-                 if words and re.fullmatch(like, words[-1])), '')
 
 
 def _is_drive(stamps_ns: Sequence[int | None]) -> bool:

@@ -72,7 +72,8 @@ Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
 
 def open_frames(path: Paths, topic: str | None = None, fps: float | None = None,
-                start_s: float = 0.0, duration_s: float | None = None) -> FrameSource:
+                start_s: float = 0.0, duration_s: float | None = None,
+                stamps: str | os.PathLike[str] | None = None) -> FrameSource:
     """Open a recorded drive. The kind of input is detected from the content of the files.
 
     path: a ROS 2 bag (folder, .mcap, .db3, with or without zstd), a ROS 1 .bag, a video file, or a
@@ -87,6 +88,7 @@ def open_frames(path: Paths, topic: str | None = None, fps: float | None = None,
     of a video ('2').
     fps: image rate in Hz, of a folder without times (default 10), or instead of a video's stamps.
     start_s, duration_s: part of the drive to use, in seconds; None: up to its end.
+    stamps: a list of the times of a folder's images; None: it is looked for.
 
     Raises InputError if there is nothing to read, or if the topic is ambiguous.
     """
@@ -98,11 +100,23 @@ def open_frames(path: Paths, topic: str | None = None, fps: float | None = None,
     if not groups:
         raise InputError('E-INPUT-MISSING',
                          'no input was given: pass a bag, a video or a folder of images')
-    if len(groups) == 1 and len(groups[0].paths) == 1:
+    if stamps is not None:
+        source = _with_stamps(groups, topic, fps, path_of(stamps))
+    elif len(groups) == 1 and len(groups[0].paths) == 1:
         source = _open_one(groups[0].paths[0], topic, fps)
     else:
         source = _joined(groups, topic, fps)
     return source if not start_s and duration_s is None else source.excerpt(start_s, duration_s)
+
+
+def _with_stamps(groups: Sequence[_Group], topic: str | None, fps: float | None, stamps: Path
+                 ) -> FrameSource:
+    from dashcalib_ros.input.folder import FolderSource
+    places = [path for group in groups for path in group.paths]
+    if len(places) != 1 or _opener_of(places[0]) is not FolderSource:
+        raise InputError('E-STAMPS-NO-FOLDER', '--stamps is for one folder of images: bags and '
+                                               'videos have their own; omit it')
+    return FolderSource(places[0], topic, fps, stamps)
 
 
 def as_list(path: Paths) -> list[str | os.PathLike[str]]:

@@ -149,12 +149,20 @@ class SensorStream:
         if recorded:
             # an uptime, of both: no time of the drive's begin is among the sensors' then
             own = not self.absolute and self.first_s <= begin_s <= self.last_s < EPOCH_S
-            return replace(self, absolute=True) if own and self.first_s > SECOND_S else self
+            if own and self.first_s > SECOND_S:
+                return replace(self, absolute=True)
+            if not self.absolute or begin_s < self.last_s:
+                return self
+            return self._of_another_time(begin_s, begin_s)
         if not self.absolute or self.begin_s is not None:
             return self
         end_s = begin_s + (length_ns or 0) / 1e9
         if begin_s < self.last_s and end_s > self.first_s:
             return replace(self, begin_s=begin_s, doubt_s=DOUBT_S)
+        return self._of_another_time(begin_s, end_s)
+
+    def _of_another_time(self, begin_s: float, end_s: float) -> SensorStream:
+        """Return the same with a warning: no image from begin_s to end_s is among its stamps."""
         return replace(self, warnings=(*self.warnings, Notice(
             'E-MOTION-OTHER-DAY', f'the time of recording of the images, '
             f'{time_text(begin_s)}, is not among those of the motion sensors, which begin at '
@@ -193,8 +201,9 @@ def zone_text(first_s: float, last_s: float, begin_s: float, end_s: float) -> st
     for hours in sorted((n / 2 for n in range(-2 * MOST_ZONES_H, 2 * MOST_ZONES_H + 1) if n),
                         key=lambda each: (each % 1, abs(each))):
         if first_s - 3600 * hours <= end_s and last_s - 3600 * hours >= begin_s:
+            way = 'earlier' if hours > 0 else 'later'
             return (f': a time zone of {abs(hours):g} h? Their stamps would fit {abs(hours):g} h '
-                    f'{"earlier" if hours > 0 else "later"}')
+                    f'{way}; use --sensor-offset={-3600 * hours:.0f}s')
     return ''
 
 

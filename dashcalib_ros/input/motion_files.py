@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motion streams: from CSV, GPX, KITTI's oxts folders, inside videos, and a bag's own topics."""
+"""Motion streams: from CSV, logs, GPX, KITTI's oxts folders, inside videos, and bags."""
 from __future__ import annotations
 
+import re
 from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -16,8 +17,10 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.errors import InputError, Notice, one_line, shortened
+from dashcalib_ros.input import novatek
 from dashcalib_ros.input.inputs import is_video
 from dashcalib_ros.input.motion import (
+    DOUBT_S,
     EPOCH_S,
     SAMPLES,
     SensorBuffer,
@@ -27,7 +30,8 @@ from dashcalib_ros.input.motion import (
     values_in,
 )
 from dashcalib_ros.input.source import by_name, os_error
-from dashcalib_ros.input.times import dated_ns, numbers_in, paired
+from dashcalib_ros.input.times import UNITS as TIME_UNITS
+from dashcalib_ros.input.times import dated_ns, numbers_in, paired, unit_of
 from dashcalib_ros.limits import (
     DIGITS,
     GPX_BYTES,
@@ -48,6 +52,30 @@ if TYPE_CHECKING:
 STAMP_COLUMN = 'stamp_s'
 COLUMNS = {'rate': ('gyro_x', 'gyro_y', 'gyro_z'), 'speed': ('speed',),
            'position': ('latitude', 'longitude', 'altitude')}
+# what --columns calls the stamp
+STAMP_OPTION = 'time'
+_PHYPHOX = {STAMP_COLUMN: 'Time (s)'}
+# how the CSV files of loggers are called in the beginning, and their headings by our names
+LOGS: tuple[tuple[str, Mapping[str, str]], ...] = (
+    # Sensor Logger: its other sensors have the same headings
+    ('gyroscope', {STAMP_COLUMN: 'time', 'gyro_x': 'x', 'gyro_y': 'y', 'gyro_z': 'z'}),
+    ('location', {STAMP_COLUMN: 'time', 'latitude': 'latitude', 'longitude': 'longitude',
+                  'altitude': 'altitude', 'speed': 'speed'}),
+    # phyphox
+    ('', {**_PHYPHOX, **{f'gyro_{axis}': f'Gyroscope {axis} (rad/s)' for axis in 'xyz'}}),
+    ('', {**_PHYPHOX, 'latitude': 'Latitude (°)', 'longitude': 'Longitude (°)',
+          'altitude': 'Height (m)', 'speed': 'Velocity (m/s)'}),
+    # EuRoC's imu0/data.csv
+    ('', {STAMP_COLUMN: 'timestamp [ns]',
+          **{f'gyro_{axis}': f'w_RS_S_{axis} [rad s^-1]' for axis in 'xyz'}}),
+    # MARS logger's gyro_accel.csv
+    ('', {STAMP_COLUMN: 'Timestamp[nanosec]',
+          **{f'gyro_{axis}': f'g{axis}[rad/s]' for axis in 'xyz'}}))
+# Gyroflow's .gcsv: its first line, lines of its head at the most, columns, and s of a stamp
+GCSV, GCSV_LINES, GCSV_TSCALE = 'GYROFLOW IMU LOG', 100, 1e-3
+GCSV_COLUMNS = {STAMP_COLUMN: 't', **{f'gyro_{axis}': f'g{axis}' for axis in 'xyz'}}
+# headings of angular rates in degrees per second, and of speeds in km/h
+DEGREES, KMH = re.compile(r'deg|dps|°'), re.compile(r'km/?h|kph')
 HEAD = f'stamp_s and any of {", ".join(chain(*COLUMNS.values()))}'
 # places in a line of KITTI's oxts: latitude, longitude, altitude; forward speed; rates x, y, z
 OXTS_POSITION, OXTS_SPEED, OXTS_RATE, OXTS_VALUES = slice(0, 3), 8, slice(17, 20), 30
@@ -64,19 +92,22 @@ NO_MESSAGE = (InputError, AttributeError, TypeError, ValueError)
 ANOTHER_CLOCK_S, LATE_MESSAGES = 60.0, 9
 
 
-def read_motion(path: Path) -> SensorStream:
+def read_motion(path: Path, columns: Mapping[str, str] | None = None) -> SensorStream:
     """Read the motion sensors of a drive from a CSV, a GPX, a KITTI oxts folder or a video.
 
-    Raises InputError for other files. Damaged samples are skipped, with a warning in the stream.
+    A CSV may be that of a known logger (LOGS), and a folder may have several of these. columns: of
+    another CSV, its headings by our names. Raises InputError for other files. Damaged samples are
+    skipped, with a warning in the stream.
     """
     if path.is_dir():
-        return _oxts(path)
+        logs = [] if columns else [each for each in sorted(path.glob('*.csv')) if _log_of(each)]
+        return _csvs(logs, path, None) if logs else _oxts(path)
     if is_video(path):
         return _inside_video(path)
     what = f'the motion file {path}'
     if _first_line(path, what).startswith('<'):
         return _gpx(read_text(path, GPX_BYTES, what), path)
-    return _csv(read_lines(path, MOTION_BYTES, what), path)
+    return _csvs([path], path, columns)
 
 
 def is_motion(path: Path) -> bool:
@@ -84,27 +115,83 @@ def is_motion(path: Path) -> bool:
     if path.is_dir() or is_video(path):
         return True
     line = _first_line(path, str(path))
-    return line.startswith('<') or STAMP_COLUMN in _names(line)
+    return line.startswith('<') or STAMP_COLUMN in _names(line) or _log_of(path) is not None
 
 
 def _first_line(path: Path, what: str) -> str:
     return next(read_lines(path, MOTION_BYTES, what), '').lstrip()
 
 
+def _mark(line: str) -> str:
+    """Return what is between the columns of a line."""
+    return next((each for each in ';\t,' if each in line), ',')
+
+
 def _names(line: str) -> list[str]:
-    return [name.strip() for name in line.removeprefix('#').split(',')]
+    return [name.strip(' \r"') for name in line.removeprefix('#').split(_mark(line))]
 
 
-def _csv(lines: Iterator[str], path: Path) -> SensorStream:
-    names = _names(next(lines, ''))
-    if STAMP_COLUMN not in names or len(set(names)) < len(names):
+def _log_of(path: Path) -> Mapping[str, str] | None:
+    """Return the headings by our names of a CSV that a known logger has written."""
+    try:
+        names = set(_names(_first_line(path, str(path))))
+    except InputError:
+        return None
+    return next((columns for stem, columns in LOGS if names >= set(columns.values())
+                 and path.stem.lower().startswith(stem)), None)
+
+
+def _csvs(files: Sequence[Path], path: Path, columns: Mapping[str, str] | None) -> SensorStream:
+    """Read files of one logger as one stream. path: for messages."""
+    values: dict[str, tuple[Floats, Floats]] = {}
+    warnings: list[Notice] = []
+    for file in files:
+        lines = read_lines(file, MOTION_BYTES, f'the motion file {file}')
+        found, notices = _csv(lines, file, columns)
+        values.update(found)
+        warnings += notices
+    stamps = np.concatenate([stamps for stamps, _ in values.values()])
+    known = stamps[np.isfinite(stamps)]
+    stream = sensor_stream(values, str(path), bool(len(known) and known[0] > EPOCH_S))
+    return replace(stream, warnings=(*warnings, *stream.warnings))
+
+
+def _csv(lines: Iterator[str], path: Path, columns: Mapping[str, str] | None
+         ) -> tuple[dict[str, tuple[Floats, Floats]], tuple[Notice, ...]]:
+    """Return the values of a CSV by kind, and what is to be said."""
+    head, scales = next(lines, ''), dict[str, float]()
+    if head.strip() == GCSV:
+        # its orientation is Gyroflow's: the chip's own axes are those of a rotation
+        for line in islice(lines, GCSV_LINES):
+            key, _, value = line.partition(',')
+            if key == 't':
+                head, columns = line, GCSV_COLUMNS
+                break
+            scales[key] = _number(value)
+    names, mark = _names(head), _mark(head)
+    ours = columns or _log_of(path) or {name: name for name in names}
+    missing = [theirs for theirs in ours.values() if theirs not in names]
+    if columns and missing:
+        raise InputError('E-MOTION-COLUMNS', f'{path} has no column {missing[0]!r}: use those of '
+                         f'its first line ({shortened(", ".join(names), 200)})')
+    if STAMP_COLUMN not in ours or len(set(names)) < len(names):
         raise InputError('E-MOTION-HEADER', f'{path} is not a CSV of motion sensors: its first '
-                         f'line must contain the column names {HEAD}; for poses, use --poses')
+                         f'line must contain the column names {HEAD}; or say which columns they '
+                         f'are with --columns {STAMP_OPTION}=t_ms,gyro_x=wx,gyro_y=wy,gyro_z=wz; '
+                         f'for poses, use --poses')
     # only what is used: a file may have any number of columns
-    used = [name for name in names if name in (STAMP_COLUMN, *chain(*COLUMNS.values()))]
-    table = _table(lines, len(names), [names.index(name) for name in used])
-    column = dict(zip(used, table.T, strict=True))
-    stamps, warnings = in_seconds(column[STAMP_COLUMN], str(path))
+    used = [name for name in (STAMP_COLUMN, *chain(*COLUMNS.values())) if name in ours]
+    table = _table(lines, len(names), [names.index(ours[name]) for name in used], mark)
+    column = {name: values * _factor(name, ours[name], scales)
+              for name, values in zip(used, table.T, strict=True)}
+    stamps, warnings = column[STAMP_COLUMN], tuple[Notice, ...]()
+    unit = '' if ours[STAMP_COLUMN] == STAMP_COLUMN else unit_of(ours[STAMP_COLUMN])
+    if scales:
+        stamps = stamps * scales.get('tscale', GCSV_TSCALE)
+    elif unit:
+        stamps = stamps * (TIME_UNITS[unit] / TIME_UNITS['seconds'])
+    else:
+        stamps, warnings = in_seconds(stamps, str(path))
     values: dict[str, tuple[Floats, Floats]] = {}
     for kind, wanted in COLUMNS.items():
         there = [name for name in wanted if name in column]
@@ -124,20 +211,27 @@ def _csv(lines: Iterator[str], path: Path) -> SensorStream:
     if not values:
         raise InputError('E-MOTION-HEADER', f'{path} has no sensor column: its first line must '
                          f'contain the column names {HEAD}')
-    late = stamps[np.isfinite(stamps)]
-    found = sensor_stream(values, str(path), bool(len(late) and late[0] > EPOCH_S))
-    return replace(found, warnings=(*warnings, *found.warnings))
+    return values, warnings
 
 
-def _table(lines: Iterable[str], width: int, places: Sequence[int]) -> Floats:
+def _factor(ours: str, theirs: str, scales: Mapping[str, float]) -> float:
+    """Return what a column is to be multiplied by, as its heading or the file's head says."""
+    if ours.startswith('gyro'):
+        return (scales.get('gscale', 1.0) if scales else
+                np.pi / 180 if DEGREES.search(theirs.lower()) else 1.0)
+    return 1 / 3.6 if ours == 'speed' and KMH.search(theirs.lower()) else 1.0
+
+
+def _table(lines: Iterable[str], width: int, places: Sequence[int], mark: str = ',') -> Floats:
     """Return numbers (n, k) of these places of lines, SAMPLES + 1 lines at the most.
 
-    width: values of a line. NaN for what is no number, and for all of a broken line.
+    width: values of a line; mark: between them. NaN for what is no number, and for all of a broken
+    line.
     """
     found = array('d')
     for line in islice(filter(str.strip, lines), SAMPLES + 1):
-        if line.count(',') == width - 1:
-            cells = line.split(',')
+        if line.count(mark) == width - 1:
+            cells = line.split(mark)
             found.extend(_number(cells[place]) for place in places)
         else:
             found.extend([np.nan] * len(places))
@@ -147,6 +241,11 @@ def _table(lines: Iterable[str], width: int, places: Sequence[int]) -> Floats:
 def _number(text: str) -> float:
     try:
         return float(text)
+    except ValueError:
+        pass
+    try:
+        # quotes, and the comma of many countries
+        return float(text.strip(' \r"').replace(',', '.'))
     except ValueError:
         return np.nan
 
@@ -221,9 +320,14 @@ def _gpx(text: str, path: Path) -> SensorStream:
 
 
 def _inside_video(path: Path) -> SensorStream:
-    """Read the gyro, and of a GoPro GPS, that a camera has written into its video."""
+    """Read the gyro or GPS that a camera has written into its video."""
     try:
         check_file(path, f'the video {path}')
+        if inside := novatek.fixes(path):
+            rows = np.array(inside)
+            return replace(sensor_stream({'position': (rows[:, 0], rows[:, 1:4]),
+                                          'speed': (rows[:, 0], rows[:, 4:])}, str(path)),
+                           doubt_s=DOUBT_S)
     except OSError as error:
         raise os_error(path, error) from error
     try:

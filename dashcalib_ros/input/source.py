@@ -183,6 +183,7 @@ class FrameSource(ABC):
     length_ns: length of the drive if its stamps start at 0, otherwise None.
     recorded: the stamps are times of recording, as in a bag. begin_ns: start of the recording,
     None if unknown.
+    part: (x, y, width, height) that is used of each image, px; None: all of it.
     warnings: what the user should know about the input, one line each; complete after the last
     frame. contradictions: those that may explain why a drive is not sufficient, with the cure.
 
@@ -196,6 +197,7 @@ class FrameSource(ABC):
     length_ns: int | None = None
     recorded = False
     contradictions: tuple[Notice, ...] = ()
+    part: tuple[int, int, int, int] | None = None
     _cure = 'check that another program can play it, or record it again'
     _start_ns = 0
     _duration_ns: int | None = None
@@ -217,6 +219,16 @@ class FrameSource(ABC):
     def warnings(self) -> tuple[Notice, ...]:
         """Return what the user should know, one line each; complete after the last frame."""
         return self.contradictions + self._opening_warnings + self._reading_warnings
+
+    def first_size(self) -> tuple[int, int]:
+        """Return (width, height) of whole images as they are stored; reads one where needed."""
+        whole = copy.copy(self)
+        whole.part = None
+        size = self.stored_size or (None if self.part else self.size)
+        if size is None:
+            with closing(iter(whole)) as frames:
+                size = next(frames).size
+        return size
 
     def stored(self, camera: Camera) -> Camera | None:
         """Return a camera of these images for the pictures as they are stored.
@@ -249,6 +261,26 @@ class FrameSource(ABC):
             part.count = None
         return part
 
+    def cropped(self, left: int, top: int, width: int, height: int) -> FrameSource:
+        """Return the same drive, of a part of each image."""
+        source = copy.copy(self)
+        source.part, source.size, source.stored_size = (left, top, width, height), (
+            width, height), None
+        return source
+
+    def _cut(self, image: Pixels) -> Pixels:
+        """Return the part of an image that is used. Raises InputError where it sticks out."""
+        if self.part is None:
+            return image
+        left, top, width, height = self.part
+        if (min(left, top) < 0 or min(width, height) < 1 or left + width > image.shape[1]
+                or top + height > image.shape[0]):
+            raise InputError('E-CROP-OUTSIDE',
+                             f'{left},{top},{width},{height} is no part of a picture of '
+                             f'{image.shape[1]}x{image.shape[0]}; write X,Y,W,H in px: the top '
+                             f'left corner of the part, and its size')
+        return image[top:top + height, left:left + width].copy()
+
     def __iter__(self) -> Generator[Frame, None, None]:
         reading = Reading()
         try:
@@ -273,7 +305,7 @@ class FrameSource(ABC):
                     self._pictures(Reading(), max(0, start_ns))) as pictures:
                 for picture in pictures:
                     if picture.index in stamps_ns:
-                        found[picture.index] = picture.decode(colour=True)
+                        found[picture.index] = self._cut(picture.decode(colour=True))
                     if picture.index >= last:
                         break
         return found
@@ -286,7 +318,7 @@ class FrameSource(ABC):
                 after_gap |= picture.after_gap
                 perhaps |= picture.perhaps_after_gap
                 try:
-                    image = picture.decode()
+                    image = self._cut(picture.decode())
                 except InputError as error:
                     reading.failed(picture.index, error, picture.file)
                     continue

@@ -21,6 +21,9 @@ DATE = re.compile(
     r'(?P<H>\d\d)[-_.:h]?(?P<M>\d\d)[-_.:m]?(?P<S>\d\d)'
     r'(?:(?:[.,_s]|(?<!:\d\d)-)?(?P<part>\d{1,9}))?(?P<zone>Z|[+-]\d\d:?\d\d)?(?!\d)')
 UNITS = {'seconds': SECOND_NS, 'milliseconds': 10**6, 'microseconds': 1000, 'nanoseconds': 1}
+# how headings of columns end that name a unit
+UNIT_HEADINGS = {'nanoseconds': r'ns|nsecs?|nano\w*', 'microseconds': r'us|µs|usecs?|micro\w*',
+                 'milliseconds': r'ms|msecs?|milli\w*', 'seconds': r's|secs?|seconds?'}
 # ns since 1970: from the year 2001 on; numbers and dates of smaller ones look like others
 EPOCH_NS = 10**18
 # ns between two images of a drive: where the time since 1970 tells the unit, and else, by which
@@ -55,6 +58,13 @@ def dated_ns(text: str) -> int | None:
     """Return ns since 1970 of a date and time in a text, None where there is none."""
     found = dated(text)
     return None if found is None else found[0] * SECOND_NS + int(found[1].ljust(9, '0'))
+
+
+def unit_of(heading: str) -> str:
+    """Return the unit that a heading names, such as 'timestamp [ns]' or stamp_s; '' for none."""
+    words = re.findall(r'[a-zµ]+', heading.lower())
+    return next((unit for unit, like in UNIT_HEADINGS.items()
+                 if words and re.fullmatch(like, words[-1])), '')
 
 
 def rising(stamps: Sequence[float]) -> list[int]:
@@ -186,17 +196,20 @@ def _goes_on(ns: Sequence[int], unit: str, middle: float) -> bool:
 def _read(stems: Sequence[str]) -> Iterator[tuple[list[Decimal | None], str, bool]]:
     """Yield the ways to read names as numbers: these, their unit where known, if of two parts."""
     dates = [dated(stem) for stem in stems]
-    if dates.count(None) <= LACKING * len(stems):
+    coarse = dates.count(None) <= LACKING * len(stems)
+    if coarse:
         longest = max(len(date[1]) for date in dates if date)
         # 5 ms may be written _5; and whole seconds are too coarse
         if longest:
             yield ([date and Decimal(date[0]) + Decimal(int(date[1] or 0)).scaleb(-longest)
                     for date in dates], 'seconds', True)
-        return
+            return
+        # nuScenes: the drive's date, and then the image's time
+        stems = [DATE.sub('', stem, count=1) for stem in stems]
     split = [re.split(r'(\d+)', stem) for stem in stems]
     # the same text between the numbers; 12 beside 12.5 is one number
     usual, count = Counter(tuple(each[::2]) for each in split).most_common(1)[0]
-    if count < len(stems):
+    if count < len(stems) and not coarse:
         plain = [re.fullmatch(r'(\D*)(\d+(?:\.\d+)?)(\D*)', stem) for stem in stems]
         if None not in plain and len({each.group(1, 3) for each in plain if each}) == 1:
             yield [each and Decimal(each[2]) for each in plain], '', True
@@ -210,7 +223,7 @@ def _read(stems: Sequence[str]) -> Iterator[tuple[list[Decimal | None], str, boo
         return [Decimal(text) if text else None for text in groups[place]]
 
     varying = [place for place, texts in enumerate(groups) if len({*texts, ''}) > 2]
-    for place in varying:
+    for place in () if coarse else varying:
         part = place + 1
         if part < len(groups) and usual[part] in ('.', ',', '_', '-'):
             digits = {len(text) for text in groups[part] if text}
@@ -228,7 +241,7 @@ def _read(stems: Sequence[str]) -> Iterator[tuple[list[Decimal | None], str, boo
         # a number that is beside others is a time only where it is one since 1970
         values = numbers(place)
         known = [value for value in values if value is not None]
-        if len(varying) == 1 or any(
+        if (len(varying) == 1 and not coarse) or any(
                 EPOCH_NS <= median(known) * ns <= LAST_NS for ns in UNITS.values()):
             yield values, '', False
 

@@ -331,6 +331,7 @@ class CalibrationData:
     fits the calibration without it, full-size images' px; () for fewer than three turns.
     straight_lines: the distortion by upright lines of the world; None: too few of them.
     witnesses: the focal length by the car's own sensors. known: what somebody knew before.
+    part: (x, y, width, height) of the pictures, px, that camera and all else are of; None: all.
     start_s: stamp of the first image. material: what the report draws, None in a live drive.
     """
 
@@ -345,6 +346,7 @@ class CalibrationData:
     versions: dict[str, str] = default(hash=False)
     config: Config
     input_name: str = ''
+    part: tuple[int, int, int, int] | None = None
     warnings: tuple[Notice, ...] = ()
     magnitudes: Floats | None = default(default=None, compare=False)
     mask: Mask | None = default(default=None, compare=False)

@@ -21,9 +21,9 @@ from dashcalib_ros.errors import ConfigError, InputError
 from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
 from dashcalib_ros.ros.interface import CALIBRATOR, CHECKER, PUBLISHED, SERVICES, SUBSCRIBED
 
-# these take effect at once; all others are read-only while the node runs
 # an array of integers; the core has it as a text
 LIST = 'mask.segmentation_classes'
+# these take effect at once; all others are read-only while the node runs
 CHANGEABLE = ('commit', 'publish_stale', 'turns.wanted')
 # a checker publishes and keeps nothing
 CALIBRATOR_ONLY = frozenset((

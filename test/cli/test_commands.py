@@ -26,6 +26,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from dashcalib_ros.camera import AUTO, calibrated_models, ros_camera
 from dashcalib_ros.cli import main
+from dashcalib_ros.cli.arguments import make_parser
+from dashcalib_ros.cli.drive import open_drive
 from dashcalib_ros.cli.terminal import Stages
 from dashcalib_ros.config import Config
 from dashcalib_ros.demo import Drive, Lens, demo_drive, render_to_bag
@@ -527,3 +529,25 @@ def test_demo_leaves_no_temporary_bag(fake, rendered, tmp_path, monkeypatch):
     monkeypatch.setattr(fake, 'failure', KeyboardInterrupt())
     assert main(['demo']) == 130
     assert names(tmp_path / 'tmp') == [] and names(tmp_path / 'work') == []
+
+
+def test_stamps_columns_and_an_offset_reach_the_drive(drive, tmp_path):
+    (tmp_path / 'list').write_text('\n'.join(f'{n / 5:.1f}' for n in range(4)))
+    (tmp_path / 'log.csv').write_text('t_ms,wx,wy,wz\n' + '\n'.join(
+        f'{100 * n},0,0.1,{0.01 * n}' for n in range(20)))
+    opened = open_drive(make_parser().parse_args([
+        'run', drive, '--stamps', str(tmp_path / 'list'), '--motion', str(tmp_path / 'log.csv'),
+        '--columns', 'time=t_ms,gyro_x=wx,gyro_y=wy,gyro_z=wz', '--sensor-offset=-1h',
+        '--crop', '8,4,32,16']))
+    assert [(frame.stamp_ns, frame.size) for frame in opened.source] == [
+        (2 * 10**8 * n, (32, 16)) for n in range(4)]
+    np.testing.assert_allclose(opened.motion.rate.stamps_s, 0.1 * np.arange(20) - 3600)
+    np.testing.assert_allclose(opened.motion.rate.values[3], [0, 0.1, 0.03])
+
+
+@pytest.mark.parametrize('wrong', [
+    ['--columns', 'time=t_ms,gyro=wx'], ['--columns', 'time'], ['--sensor-offset', 'soon'],
+    ['--columns', 'time=t_ms'], ['--crop', '1,2,3']])
+def test_what_is_no_column_offset_or_part_is_refused(drive, wrong, capsys):
+    assert main(['run', drive, *wrong]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1

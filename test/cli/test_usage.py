@@ -337,7 +337,7 @@ def test_a_lens_profile_has_the_readout_time_of_its_rows(here, results, tmp_path
 
 
 def test_export_to_what_there_is_not(here, results):
-    done = here('export', results / 'a', '--to', 'matlab')
+    done = here('export', results / 'a', '--to', 'blender')
     assert_one_line_error(done)
     assert ', '.join(EXPORTS) in done.stderr
     assert_one_line_error(here('export', results / 'missing', '--to', 'ros'))

@@ -117,7 +117,7 @@ def test_a_result_reads_back(tmp_path):
     (b'{"verdict": ', 'E-JSON-INVALID'), (b'{"a": ' * 100000, 'E-JSON-INVALID'),
     (b'\xff\xfe\x00junk', 'E-FILE-NOT-TEXT'),
     (b'{"fx": ' + b'7' * 5000 + b'}', 'E-JSON-INVALID'),
-    (b'{"notes": "' + b' ' * 2**22 + b'"}', 'E-FILE-TOO-LARGE'),
+    (b'{"notes": "' + b' ' * 2**23 + b'"}', 'E-FILE-TOO-LARGE'),
     (b'[1, 2]', 'E-OTHER-CALIBRATION'),
     (b'{"verdict": "weak", "image_size": [3, 2]}', 'E-NO-RESULT-FILE'),
 ])

@@ -2,6 +2,7 @@
 """Motion streams from files, bags and live samples."""
 from __future__ import annotations
 
+import struct
 import sys
 import tracemalloc
 from datetime import datetime, timezone
@@ -13,6 +14,7 @@ from made_gopro import gopro
 from refused import refused
 
 from dashcalib_ros.errors import InputError
+from dashcalib_ros.input import novatek
 from dashcalib_ros.input.inputs import open_frames
 from dashcalib_ros.input.motion import (
     DEGREE_M,
@@ -508,3 +510,133 @@ def test_a_car_stood_only_where_its_speed_says_so_all_the_time():
     # odometry that is not wired, and none
     dead = SensorStream(speed=Samples(stamps_s, 0 * speed))
     assert not dead.stood(11.0, 19.0) and not SensorStream().stood(11.0, 19.0)
+
+
+RATES = [(0.1, 0.2, -0.3), (0.2, 0.1, -0.4)]
+EPOCH_NS = 1_700_000_000_000_000_000
+
+
+def rows(start, step, *values, mark=','):
+    """Return 30 lines of a log: its stamps, and the values, which repeat."""
+    return [mark.join(map(str, (start + n * step, *(each(n) for each in values))))
+            for n in range(30)]
+
+
+def rate(axis, scale=1.0):
+    return lambda n: RATES[n % 2][axis] / scale
+
+
+LOGS = {
+    'Gyroscope.csv': ['time,seconds_elapsed,z,y,x', *rows(
+        EPOCH_NS, 10**7, lambda n: n / 100, rate(2), rate(1), rate(0))],
+    'phyphox.csv': ['"Time (s)","Gyroscope x (rad/s)","Gyroscope y (rad/s)",'
+                    '"Gyroscope z (rad/s)","Absolute (rad/s)"', *rows(
+                        0, 0.01, rate(0), rate(1), rate(2), lambda n: 0.4)],
+    'comma.csv': ['"Time (s)"\t"Gyroscope x (rad/s)"\t"Gyroscope y (rad/s)"\t'
+                  '"Gyroscope z (rad/s)"', *(line.replace('.', ',') for line in rows(
+                      0, 0.01, rate(0), rate(1), rate(2), mark='\t'))],
+    'data.csv': ['#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],'
+                 'a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]', *rows(
+                     EPOCH_NS, 10**7, rate(0), rate(1), rate(2), *[lambda n: 9.8] * 3)],
+    'gyro_accel.csv': ['Timestamp[nanosec], gx[rad/s], gy[rad/s], gz[rad/s], ax[m/s^2]', *rows(
+        5 * 10**12, 10**7, rate(0), rate(1), rate(2), lambda n: 9.8)],
+    'fly.gcsv': ['GYROFLOW IMU LOG', 'version,1.3', 'id,logger', 'orientation,YxZ',
+                 'tscale,0.001', 'gscale,0.0001', 'ascale,0.1', 't,gx,gy,gz,ax,ay,az', *rows(
+                     0, 10, rate(0, 1e-4), rate(1, 1e-4), rate(2, 1e-4), *[lambda n: 1] * 3)]}
+
+
+@pytest.mark.parametrize('name', LOGS)
+def test_the_logs_of_phones_and_loggers(tmp_path, name):
+    stream = read_motion(write(tmp_path / name, '\n'.join(LOGS[name])))
+    np.testing.assert_allclose(stream.rate.values[:2], RATES, rtol=1e-9)
+    np.testing.assert_allclose(np.diff(stream.rate.stamps_s), 0.01, atol=1e-6)
+    assert stream.absolute == (name in ('Gyroscope.csv', 'data.csv'))
+    start = {'Gyroscope.csv': 1.7e9, 'data.csv': 1.7e9, 'gyro_accel.csv': 5e3}.get(name, 0.0)
+    assert stream.rate.stamps_s[0] == pytest.approx(start)
+
+
+def test_a_folder_of_sensor_logger_has_gyro_and_gps(tmp_path):
+    write(tmp_path / 'Gyroscope.csv', '\n'.join(LOGS['Gyroscope.csv']))
+    # an accelerometer has the same headings as a gyro
+    write(tmp_path / 'Accelerometer.csv', '\n'.join(LOGS['Gyroscope.csv']))
+    write(tmp_path / 'Location.csv', '\n'.join([
+        'time,seconds_elapsed,speed,altitude,longitude,latitude', *rows(
+            EPOCH_NS, 10**9, lambda n: n, lambda n: 10.0, lambda n: 100.0, lambda n: 8.0,
+            lambda n: 49 + n / 10**4)]))
+    stream = read_motion(tmp_path)
+    assert len(stream.rate.stamps_s) == len(stream.position.stamps_s) == 30
+    np.testing.assert_allclose(stream.speed.values, 10)
+    with pytest.raises(InputError) as raised:
+        read_motion(tmp_path / 'Accelerometer.csv')
+    assert raised.value.code == 'E-MOTION-HEADER'
+
+
+def test_columns_of_any_csv_are_named(tmp_path):
+    path = write(tmp_path / 'a.csv', '\n'.join([
+        't_ms;wx [deg/s];wy [deg/s];wz [deg/s];v_kmh', *rows(
+            0, 10, rate(0, np.pi / 180), rate(1, np.pi / 180), rate(2, np.pi / 180),
+            lambda n: 36, mark=';')]))
+    named = {'stamp_s': 't_ms', 'gyro_x': 'wx [deg/s]', 'gyro_y': 'wy [deg/s]',
+             'gyro_z': 'wz [deg/s]', 'speed': 'v_kmh'}
+    stream = read_motion(path, named)
+    np.testing.assert_allclose(stream.rate.values[:2], RATES)
+    np.testing.assert_allclose(stream.rate.stamps_s[:3], [0, 0.01, 0.02])
+    np.testing.assert_allclose(stream.speed.values, 10)
+    with pytest.raises(InputError) as raised:
+        read_motion(path, {**named, 'gyro_x': 'w'})
+    assert raised.value.code == 'E-MOTION-COLUMNS' and 'wx' in str(raised.value)
+
+
+def test_a_whole_hour_is_told_with_its_option(tmp_path):
+    path = write(tmp_path / 'Gyroscope.csv', '\n'.join(LOGS['Gyroscope.csv']))
+    later = EPOCH_NS + 3600 * 10**9 + 10**8
+    [line] = read_motion(path).on_clock_of(later, True, None).warnings[-1:]
+    assert line.code == 'E-MOTION-OTHER-DAY' and '--sensor-offset=3600s' in line
+    shifted = read_motion(path).shifted(3600.0).on_clock_of(later, True, None)
+    assert 'E-MOTION-OTHER-DAY' not in [each.code for each in shifted.warnings]
+
+
+def novatek_video(path, place, lost=(0, 1)):
+    """Write an MP4 with the GPS of 30 s, as a Viofo has it; two seconds without a fix."""
+    def box(name, data):
+        return struct.pack('>I4s', 8 + len(data), name) + data
+
+    head, blocks = box(b'ftyp', b'isom' + bytes(4)), []
+    for n in range(30):
+        fix = struct.pack(
+            '<6I4s4f', 10, 59 + (30 + n) // 60 - 1, (30 + n) % 60, 26, 11, 27,
+            b'V\0\0\0' if n in lost else b'ASW\0', 4807.5 + 0.006 * n, 1131.0, 10.0, 90.0)
+        data = b'GPS ' + bytes(place - 12) + fix
+        blocks.append(box(b'free', data + bytes(116 - len(data))))
+    begin = len(head) + 8
+    places = b''.join(struct.pack('>II', begin + 124 * n, 124) for n in range(30))
+    places = box(b'gps ', struct.pack('>II', 0, 30) + places)
+    movie = box(b'moov', box(b'mvhd', bytes(100)) + places)
+    path.write_bytes(head + box(b'mdat', b''.join(blocks)) + movie)
+    return path
+
+
+@pytest.mark.parametrize('place', [16, 48])
+def test_the_gps_of_novatek_s_dashcams(tmp_path, place):
+    stream = read_motion(novatek_video(tmp_path / 'a.mp4', place))
+    # the first fix is of the third second
+    np.testing.assert_allclose(stream.position.stamps_s, range(2, 30))
+    np.testing.assert_allclose(stream.speed.values, 10 * 1852 / 3600, rtol=1e-5)
+    # south of the equator more is farther south: 0.006 minutes a second
+    # as far as 4 bytes tell
+    np.testing.assert_allclose(np.diff(stream.position.values[:, 1]), -0.0001 * 111_320, atol=1)
+    np.testing.assert_allclose(novatek.fixes(tmp_path / 'a.mp4')[0][1:3], (
+        -(48 + 7.512 / 60), -(11 + 31 / 60)), atol=1e-5)
+    assert not stream.absolute and stream.doubt_s > 0
+
+
+def test_a_damaged_video_of_novatek_s_is_read_as_far_as_it_goes(tmp_path):
+    path = novatek_video(tmp_path / 'a.mp4', 48)
+    whole = path.read_bytes()
+    for cut in (20, 100, 2000, len(whole) - 100, len(whole) - 3):
+        path.write_bytes(whole[:cut])
+        novatek.fixes(path)
+    path.write_bytes(whole[:-8] + struct.pack('>II', 2**32 - 1, 2**32 - 1))
+    assert len(novatek.fixes(path)) == 27
+    path.write_bytes(b'')
+    assert novatek.fixes(path) == []

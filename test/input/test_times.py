@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from made_drives import drive, images, write_bag, write_folder
 
+from dashcalib_ros.errors import InputError
 from dashcalib_ros.input.folder import FolderSource, times_of
 from dashcalib_ros.input.inputs import open_frames
 from dashcalib_ros.input.source import by_name
@@ -34,6 +35,9 @@ NAMINGS = {
     'counted, too': lambda ns: f'{ns // 10**7:06}_{(BEGIN + ns) // 1000}',
     'a date': lambda ns: date(BEGIN + ns, '%Y-%m-%d_%H-%M-%S-%f'),
     'a short date': lambda ns: date(BEGIN + ns, 'IMG_%Y%m%d_%H%M%S%f')[:-3],
+    'nuScenes': lambda ns: (f'n015-2018-07-24-11-{22 + ns // 10**10 % 2}-45+0800__CAM_FRONT__'
+                            f'{(BEGIN + ns) // 1000}'),
+    'Argoverse': lambda ns: f'ring_front_center_{BEGIN + ns}',
     'uptime in ns': lambda ns: f'{98_765_432_109_876 + ns}',
     'uptime in us': lambda ns: f'{(98_765_432_109_876 + ns) // 1000}',
     'uptime in s': lambda ns: f'frame{(12_345_678_901 + ns) / 10**9:.4f}',
@@ -155,6 +159,24 @@ def test_a_list_beside_the_images_has_their_times(tmp_path, file):
     [told] = source.warnings
     assert told.code == 'E-TIMES-READ' and Path(file).name in told
     assert [each.code for each in FolderSource(folder, fps=10.0).warnings] == ['E-FPS-IGNORED']
+
+
+@pytest.mark.parametrize('file', LISTS)
+def test_a_list_that_is_given_may_be_anywhere(tmp_path, file):
+    lines, stems = LISTS[file]
+    folder, path = folder_of(tmp_path, stems), tmp_path / 'far' / f'imu_{Path(file).name}'
+    path.parent.mkdir()
+    path.write_text('\n'.join(lines) + '\n')
+    source = open_frames(folder, stamps=path)
+    np.testing.assert_allclose(np.array(source._stamps_ns) - source._stamps_ns[0], TIMES,
+                               atol=1001)
+    path.write_text('1 2\n3 4\n')
+    with pytest.raises(InputError) as raised:
+        open_frames(folder, stamps=path)
+    assert raised.value.code == 'E-STAMPS-UNUSED'
+    with pytest.raises(InputError) as raised:
+        open_frames([folder, folder], stamps=path)
+    assert raised.value.code == 'E-STAMPS-NO-FOLDER'
 
 
 def test_a_list_pairs_by_number_where_images_are_missing(tmp_path):
