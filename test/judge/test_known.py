@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What somebody knows: it counts by its sigma, and not where the turns contradict it."""
+from __future__ import annotations
+
+import pytest
+from solving import CONFIG, scenes_of, solved
+from synthetic import LENS
+
+from dashcalib_ros.config import Config, KnownConfig
+from dashcalib_ros.errors import ConfigError
+from dashcalib_ros.judge.known import with_known
+from dashcalib_ros.judge.verdict import judge
+
+
+@pytest.fixture(scope='module')
+def found():
+    return solved(scenes_of(2))
+
+
+@pytest.mark.parametrize(('name', 'text', 'value'), [
+    ('fx', '519.9±0.3', 519.9), ('hfov', '81±0.1', 81.0), ('aspect', '1±0.0001', 1.0),
+    ('shutter', 'global', 0.0), ('shutter', '0.1±0.2ms', 1e-4)])
+def test_each_piece_makes_the_camera_better_known(found, name, text, value):
+    known = KnownConfig(**{name: text})
+    informed, [piece] = with_known(found, known, 1.0)
+    assert piece.name == name and piece.value == pytest.approx(value)
+    if piece.used:
+        # which of the cases in sigma is likelier may change a little
+        assert piece.fx_sigma <= 1.05 * piece.fx_sigma_without
+        assert piece.fx_sigma_without == pytest.approx(found.sigma[0])
+        assert informed.sigma[0] == pytest.approx(piece.fx_sigma)
+    if name == 'fx':
+        assert piece.used and piece.fx_sigma < 0.3
+        assert abs(informed.camera.fx - 519.9) < abs(found.camera.fx - 519.9) + 1e-9
+    if name == 'shutter':
+        assert piece.used and abs(informed.readout_s - value) <= abs(found.readout_s - value)
+
+
+def test_pixels_of_the_input_count(found):
+    _, [piece] = with_known(found, KnownConfig(fx='1040±10'), 2.0)
+    assert piece.by_turns == pytest.approx(2 * found.camera.fx) and piece.used
+
+
+def test_what_the_turns_contradict_does_not_count(found):
+    informed, [piece] = with_known(found, KnownConfig(fx='600±5'), 1.0)
+    assert not piece.used and informed is found
+    assert piece.fx_sigma == piece.fx_sigma_without
+
+
+def test_nothing_known_is_nothing_changed(found):
+    assert with_known(found, KnownConfig(), 1.0) == (found, ())
+
+
+@pytest.mark.parametrize(('name', 'text'), [
+    ('fx', '1160'), ('fx', 'NaN±1'), ('shutter', '24'), ('shutter', 'rolling'), ('hfov', '120±'),
+    ('stabiliser', 'yes'), ('aspect', '-1')])
+def test_what_cannot_be_understood_is_refused(name, text):
+    with pytest.raises(ConfigError):
+        Config.of({f'known.{name}': text})
+
+
+GENTLE = {'yaws': (9.0, -12.0, 8.0)}
+
+
+def gentle(config: Config = CONFIG, sharp: bool = False):
+    from synthetic import synthetic_turn
+    yaws = (*GENTLE['yaws'], *((80.0,) if sharp else ()))
+    return solved([synthetic_turn(LENS, yaw, tracks=180, keyframes=14, noise_px=0.25,
+                                  world=world).scene(LENS, world)
+                   for world, yaw in enumerate(yaws)], config)
+
+
+def test_gentle_bends_may_be_a_stabiliser_s_unless_it_is_known_that_there_is_none():
+    unknown = gentle()
+    assert len(unknown.perhaps_shifted) == 3 and not unknown.crops
+    assert 'E-ONLY-GENTLE' in judge(unknown, CONFIG.verdict).codes
+    known = gentle(CONFIG.replace({'known.stabiliser': 'no'}))
+    assert not known.perhaps_shifted
+    assert {'E-ONLY-GENTLE', 'E-LITTLE-YAW'}.isdisjoint(judge(known, CONFIG.verdict).codes)
+    assert known.sigma[0] < unknown.sigma[0]
+    for solution in (unknown, known):
+        assert abs(solution.camera.fx - LENS.fx) < 3 * solution.sigma[0]
+
+
+def test_a_sharp_turn_shows_that_there_is_no_stabiliser():
+    solution = gentle(sharp=True)
+    assert not solution.perhaps_shifted
+    assert 'E-ONLY-GENTLE' not in judge(solution, CONFIG.verdict).codes
