@@ -204,7 +204,7 @@ def broken_limits(bench: Recorder, log: str, sent: Sequence[int], memory: Sequen
 def report(bench: Recorder, log: str, sent: list[int], restarts: int, memory: list[float],
            share: float) -> str:
     """Return the table, and what the node said, numbers aside."""
-    due = [stamp for stamp in sent if stamp >= min(bench.stamps, default=0)]
+    due = [stamp for stamp in sent if bench.stamps and stamp >= min(bench.stamps)]
     values = bench.values
     lines = ['| | |', '|---|---|',
              f'| images sent, received by the node | {len(sent)}, {values["received"]} |',
