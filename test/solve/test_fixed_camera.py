@@ -78,7 +78,7 @@ def test_a_stabilised_video_is_found_and_taken_out():
     assert verdict.codes[0] == 'E-PICTURE-MOVES'
     assert re.search(r'by up to \d+\.\d %', verdict.reasons[0])
     # ... also before what refuses it; what is less than the picture is known by does no harm
-    both = judge(found, replace(CONFIG.verdict, refused_yaw_deg=1e3)).codes
+    both = judge(found, replace(CONFIG.verdict, min_yaw_deg=1e3)).codes
     assert both[:2] == ('E-PICTURE-MOVES', 'E-LITTLE-YAW')
     lenient = CONFIG.replace({'verdict.max_crop_sigmas': 1e6})
     told = conclude(found, Evidence(SIZE, 100, (), {}, np.zeros((0, 2)), None, FULL_SIZE, {}),

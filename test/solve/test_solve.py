@@ -564,8 +564,6 @@ def test_the_outlook_counts_turns_and_angles_as_the_verdict_does(good):
     assert codes(good.scenes[:1], motion=gyro) == ('accepted', ())
     limits = replace(limits, min_yaw_deg=500.0)
     assert codes(good.scenes) == ('weak', ('E-LITTLE-YAW',))
-    limits = replace(limits, refused_yaw_deg=500.0)
-    assert codes(good.scenes[:1]) == ('refused', ('E-LITTLE-YAW', 'E-FEW-TURNS'))
     assert codes([]) == ('refused', ('E-UNDETERMINED',))
     assert codes([], built={}) == ('refused', ('E-NO-SCENE',))
 
