@@ -40,6 +40,7 @@ from dashcalib_ros.judge import CalibrationData, TurnSummary, Verdict
 from dashcalib_ros.judge.calibration import (
     ANGLES,
     Condition,
+    Drift,
     Known,
     LensField,
     Mount,
@@ -89,6 +90,7 @@ def result_dict(calibration: CalibrationData) -> dict[str, Any]:
         'straight_lines': c.straight_lines,
         'witnesses': c.witnesses,
         'known': c.known,
+        'drift': c.drift,
         'input': c.input_name,
         'part': c.part,
         'warnings': c.warnings,
@@ -180,7 +182,8 @@ def calibration_of(data: Data, camera: Camera | None) -> CalibrationData:
         held_out=tuple(held_out), straight_lines=made(Bend, data.get('straight_lines')),
         witnesses=Witnesses(**{name: made(Witness, each) for name, each
                                in (data.get('witnesses') or {}).items()}),
-        known=tuple(made(Known, each) for each in data.get('known', ())))
+        known=tuple(made(Known, each) for each in data.get('known', ())),
+        drift=made(Drift, data.get('drift')))
 
 
 def _frozen(value: Any) -> Any:

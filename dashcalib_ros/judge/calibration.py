@@ -294,6 +294,18 @@ def _with_sigma(value: float, sigma: float) -> str:
 
 
 @dataclass(frozen=True)
+class Drift:
+    """A focal length that changes over the drive, as of a lens that warms up.
+
+    fx_percent_per_hour, with its sigma; from_first_to_last_percent: over the turns.
+    """
+
+    fx_percent_per_hour: float
+    sigma: float
+    from_first_to_last_percent: float
+
+
+@dataclass(frozen=True)
 class Known:
     """What somebody knew of the camera: fx in px, hfov in degrees, aspect, shutter in s.
 
@@ -331,6 +343,7 @@ class CalibrationData:
     fits the calibration without it, full-size images' px; () for fewer than three turns.
     straight_lines: the distortion by upright lines of the world; None: too few of them.
     witnesses: the focal length by the car's own sensors. known: what somebody knew before.
+    drift: of the focal length; camera is that of the middle of the drive then. None: it is steady.
     part: (x, y, width, height) of the pictures, px, that camera and all else are of; None: all.
     start_s: stamp of the first image. material: what the report draws, None in a live drive.
     """
@@ -361,6 +374,7 @@ class CalibrationData:
     straight_lines: Bend | None = None
     witnesses: Witnesses = default(default_factory=Witnesses)
     known: tuple[Known, ...] = ()
+    drift: Drift | None = None
     start_s: float = 0.0
     material: Material | None = default(default=None, compare=False)
     covariance: Floats | None = default(default=None, compare=False)

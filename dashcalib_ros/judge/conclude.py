@@ -25,6 +25,7 @@ from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge.agreement import CONTRADICTS, focal_disagreement
 from dashcalib_ros.judge.calibration import (
     CalibrationData,
+    Drift,
     Known,
     LensField,
     Material,
@@ -197,12 +198,21 @@ def _with_numbers(found: CalibrationData, solution: Solution, lines: Bend | None
         straight_lines=lines and lines.resized(px), field=_field(solution, evidence.image_size),
         mount=spared('the mounting', lost, _mount, solution, evidence, found.verdict.level,
                      found.config),
+        drift=_drift(solution),
         rolling_shutter=Shutter(1e3 * solution.readout_s, 1e3 * solution.readout_sigma_s)
         if solution.rolling else None)
 
 
 # of pixels that are not square, or are so where they seem not to be: a warning says it
 REPORTED_SHARE = 0.05
+def _drift(solution: Solution) -> Drift | None:
+    found = solution.drift
+    if found is None:
+        return None
+    per_hour = 100 * 3600 / found.seconds
+    return Drift(per_hour * found.size, per_hour * found.sigma, 100 * found.size)
+
+
 # px RMS; a warning names a field that no lens model has, if it is larger
 REPORTED_FIELD_PX = 0.5
 
@@ -234,6 +244,13 @@ def _warnings(found: CalibrationData, solution: Solution) -> tuple[Notice, ...]:
             f'the turns do not decide whether pixels are square: that fy / fx is '
             f'{solution.camera.fy / solution.camera.fx:.3f} is wrong with a probability of '
             f'{100 * share:.0f} %, and sigma of fy contains it'))
+    if found.drift is not None and 'E-FOCAL-LENGTH-DRIFTS' not in found.verdict.codes:
+        drift = found.drift
+        warnings.append(Notice(
+            'E-FOCAL-LENGTH-DRIFT',
+            f'the focal length changes by {drift.from_first_to_last_percent:+.2f} % from the '
+            f'first turn to the last ({drift.fx_percent_per_hour:+.1f} ± {drift.sigma:.1f} % an hour), '
+            f'as of a lens that warms up: camera_info is that of the middle of the drive'))
     if found.mount is not None and found.mount.moved_s is not None:
         warnings.append(Notice(
             'E-CAMERA-MOVED',

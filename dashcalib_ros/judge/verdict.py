@@ -373,6 +373,18 @@ def _not_fixed(grounds: Grounds) -> Finding | None:
                    'fix the zoom and the focus, then record another drive')
 
 
+def _drifts(grounds: Grounds) -> Finding | None:
+    """No camera_info is right for a focal length that changes by more than fx may be off."""
+    drift, most = grounds.solution.drift, 2 * grounds.config.max_sigma
+    if drift is None:
+        return None
+    return Finding('E-FOCAL-LENGTH-DRIFTS', _graded(False, abs(drift.size) > most),
+                   f'the focal length changes by {100 * drift.size:+.1f} % during the drive',
+                   'calibrate parts of the drive separately: --start and --end').measured(
+        'change of the focal length during the drive', f'{100 * abs(drift.size):.2f} %',
+        f'at most {100 * most:.3g} %')
+
+
 def _moving(how: str, px: float, solution: Solution) -> Finding:
     share = 100 * px / solution.camera.image_size[0]
     return Finding('E-PICTURE-MOVES', 'weak',
@@ -620,7 +632,7 @@ ENOUGH: tuple[Rule, ...] = (
     one_turn_dominates, _only_gentle)
 # whether anything contradicts the result
 SOUND: tuple[Rule, ...] = (
-    turns_disagree, other_camera, _not_fixed, _uneven_times, _strange_aspect, _strange_shutter,
-    _on_bound, _folds_over, _other_model, _other_kind, _moves_sideways, _turned_pictures,
+    turns_disagree, other_camera, _not_fixed, _drifts, _uneven_times, _strange_aspect,
+    _strange_shutter, _on_bound, _folds_over, _other_model, _other_kind, _moves_sideways, _turned_pictures,
     _lines_disagree, _sensors_disagree, _two_cameras)
 RULES = (*ENOUGH, *SOUND)

@@ -446,6 +446,41 @@ class Bend(SharedBlock):
         return np.eye(len(self.value)) * BEND_PX**-2, self.value
 
 
+# what changes with time
+
+@dataclass(frozen=True)
+class Drift(SharedBlock):
+    """By how much the picture is larger at the end of the drive than at its begin, of 1; (1,).
+
+    As of a lens that warms up. begin_ns, end_ns: of the drive. sigma: of the prior. Earlier drives
+    have their own temperature, and none of it.
+    """
+
+    value: Floats = field(default_factory=lambda: np.zeros(1))
+    begin_ns: int = 0
+    end_ns: int = 1
+    sigma: float = 0.01
+
+    name: ClassVar[str] = 'drift'
+
+    def columns(self, seen: Seen) -> Floats:
+        return np.asarray((seen.from_middle * self._late(seen.observed)).T[:, None])
+
+    def ideal(self, xy: Floats, observed: Observed) -> Floats:
+        centre = middle(observed.image_size)
+        return np.asarray(centre + (xy - centre) / (1 + self.value * self._late(observed)))
+
+    def prior(self) -> tuple[Floats, Floats]:
+        return np.full((1, 1), self.sigma**-2), self.value
+
+    def _late(self, observed: Observed) -> Floats:
+        """Return (n, 1) the time of each observation, -0.5 at the begin and 0.5 at the end."""
+        if not observed.turn.of_this_drive:
+            return np.zeros((len(observed.xy), 1))
+        return ((observed.stamps_ns - self.begin_ns) / (self.end_ns - self.begin_ns)
+                - 0.5)[:, None]
+
+
 # what each image has of its own
 
 # prior sigma of a stabiliser's crop, of the width, and how long it holds it, s
@@ -518,7 +553,7 @@ def _apart(stretch: Stretch) -> Floats:
 
 # in the order in which their parameters stand, and in which pictures are undone: that of the
 # images first
-BLOCKS: tuple[type[Block], ...] = (Lens, Readout, Shake, Shift, Zoom, Smooth, Bend)
+BLOCKS: tuple[type[Block], ...] = (Lens, Readout, Shake, Shift, Zoom, Smooth, Bend, Drift)
 
 
 @dataclass(frozen=True)

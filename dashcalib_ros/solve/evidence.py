@@ -21,11 +21,11 @@ from dashcalib_ros.arrays import Floats, Ints
 from dashcalib_ros.camera import MODELS
 from dashcalib_ros.camera.mapping import mapping_error
 from dashcalib_ros.detect.turn import TurnId
-from dashcalib_ros.problem.blocks import Bend, Block, ImageBlock, Shift, Zoom
+from dashcalib_ros.problem.blocks import Bend, Block, Drift, ImageBlock, Shift, Zoom
 from dashcalib_ros.problem.normal import Normal, linearised, normal_equations
 from dashcalib_ros.problem.quadratic import Quadratic
 from dashcalib_ros.reconstruct.scene import errors_px
-from dashcalib_ros.solve.optimise import FIRST_TRACKS, Estimate
+from dashcalib_ros.solve.optimise import FIRST_TRACKS, Estimate, likeliest
 
 Kind = Literal['shift', 'zoom', 'bend']
 
@@ -44,6 +44,9 @@ TEST_LOSS = 2.0
 SHIFT_SIZES, SHIFT_NATS = (0.0005, 0.001, 0.002, 0.004, 0.008, 0.016), 3.0
 # degrees of yaw: a stabiliser hides less in a stretch; more shows whether there is one
 HIDDEN_DEG, SHARP_DEG = 20.0, 45.0
+# sigmas of a drift of the focal length over a drive among which the evidence chooses, the first
+# as good as none, and the nats it takes; turns at the least
+STEADY, DRIFTS, DRIFT_NATS, LEAST_DRIFTING = 1e-6, (0.002, 0.005, 0.015, 0.05), 4.0, 3
 # noise variances of a track by which a kind of lens must predict turns better
 LEAST_GAIN = 30.0
 # the same of another kind, of its cost: fisheyes have 0.13 and more, windscreens up to 0.06
@@ -290,6 +293,26 @@ def shift_size(found: Estimate) -> float:
     by_size = {size: nats(Shift(sigma=size)) for size in SHIFT_SIZES}
     best = max(SHIFT_SIZES, key=by_size.__getitem__)
     return best if by_size[best] - nats(None) > SHIFT_NATS else 0.0
+
+
+def drifting(found: Estimate) -> Drift | None:
+    """Return the drift of the focal length that the evidence favours; None for a steady one.
+
+    Two turns cannot tell a drift from a step.
+    """
+    stamps = [scene.tracks.stamps_ns for scene in found.scenes if scene.turn.of_this_drive]
+    if len(stamps) < LEAST_DRIFTING:
+        return None
+    begin, end = (int(pick(each)) for pick, each in (
+        (min, map(min, stamps)), (max, map(max, stamps))))
+    sizes = [Drift(begin_ns=begin, end_ns=end, sigma=size) for size in (STEADY, *DRIFTS)]
+    now = found.with_tracks(FIRST_TRACKS).having(sizes[0])
+    loss_px = now.loss_px()
+    unit = now.noise(loss_px).variance * now.inflation
+    total = Quadratic.together([normal.cost.at_noise(unit) for normal in now.normals(
+        loss_px, unit, safe=False)])
+    best = likeliest(total, now.imaging, sizes, DRIFT_NATS)
+    return best if isinstance(best, Drift) and best.sigma > STEADY else None
 
 
 def moves(tests: Sequence[FixedCameraTest]) -> bool:

@@ -13,6 +13,8 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.problem.blocks import (
     FOCAL_BOUND,
+    Block,
+    Drift,
     Readout,
     Shift,
     bounds_of,
@@ -29,6 +31,7 @@ from dashcalib_ros.solve.evidence import (
     FixedCameraTest,
     chosen_kind,
     costs_of,
+    drifting,
     fixed_camera_tests,
     moves,
     shift_size,
@@ -39,7 +42,7 @@ from dashcalib_ros.solve.optimise import (
     optimised,
     other_shape_of_pixels,
 )
-from dashcalib_ros.solve.solution import Solution
+from dashcalib_ros.solve.solution import FocalDrift, Solution
 from dashcalib_ros.solve.spread import Posterior
 from dashcalib_ros.solve.start import (
     adapted_to,
@@ -139,7 +142,7 @@ def _solved(per_turn: Sequence[Scene], config: Config, progress: Progress) -> So
         return _solved([scene for scene in per_turn if scene.turn.of_this_drive], config, progress)
     if loose := _perhaps_shifted(best):
         progress('testing whether the picture moves', 0.0)
-        best = _with_shifts(best, Shift(only=loose))
+        best = _with(best, Shift(only=loose))
     unlike = misfits(per_turn, best.seen_by_lens, best.camera, config.scene.error_px)
     tests = fixed_camera_tests(best)
     if config.intrinsics.crop_rounds and moves(tests):
@@ -147,7 +150,10 @@ def _solved(per_turn: Sequence[Scene], config: Config, progress: Progress) -> So
         best = _steadied(best, measured, config)
         tests = fixed_camera_tests(best)
     elif config.intrinsics.crop_rounds and not loose and (size := shift_size(best)):
-        best = _with_shifts(best, Shift(sigma=size))
+        best = _with(best, Shift(sigma=size))
+        tests = fixed_camera_tests(best)
+    if not best.moves and (drift := drifting(best)) is not None:
+        best = _with(best, drift)
         tests = fixed_camera_tests(best)
     return _solution(best, unlike, start.profile, tried, tests, progress)
 
@@ -299,12 +305,12 @@ def _steadied(found: Estimate, per_turn: Mapping[TurnId, Scene], config: Config)
     return now if len(now.scenes) == len(found.scenes) else found
 
 
-def _with_shifts(found: Estimate, shift: Shift) -> Estimate:
-    """Return the optimum where each image's picture may be shifted.
+def _with(found: Estimate, block: Block) -> Estimate:
+    """Return the optimum with one more block.
 
-    What such shifts do to the lens cannot be excluded, and sigma contains it.
+    What it may do to the lens cannot be excluded, and sigma contains it.
     """
-    now = found.having(shift)
+    now = found.having(block)
     for steps in LAST_STEPS:
         now = optimised(now.retriangulated(), 0.0, steps)
     return now
@@ -340,6 +346,17 @@ def _posterior(found: Estimate) -> Posterior:
     return known.erring_together(GENTLE_SHIFTED if found.moves else GENTLE) if gentle else known
 
 
+def _drift_of(found: Estimate, posterior: Posterior) -> FocalDrift | None:
+    """Return by how much the focal length changes over the drive; None for a steady one."""
+    drift = found.imaging.blocks.get(Drift.name)
+    if not isinstance(drift, Drift):
+        return None
+    place = found.imaging.places[Drift.name]
+    return FocalDrift(float(drift.value[0]),
+                      float(np.sqrt(posterior.covariance[place, place].item())),
+                      (drift.end_ns - drift.begin_ns) / 1e9)
+
+
 def _solution(found: Estimate, unlike: Mapping[TurnId, float], coarse: Profile,
               tried: tuple[Candidate, ...], tests: tuple[FixedCameraTest, ...],
               progress: Progress) -> Solution:
@@ -359,6 +376,7 @@ def _solution(found: Estimate, unlike: Mapping[TurnId, float], coarse: Profile,
     assert isinstance(shift, Shift)
     return Solution(
         written=result, posterior=posterior, scenes=scenes, coarse=coarse, around=around,
+        drift=_drift_of(found, posterior),
         centred=type(result.camera).centred(
             lens.image_size, centred.fx, *centred.params[4:min(count, 6)]),
         bounds=bounds_of(centred)[:, :count],

@@ -16,9 +16,8 @@ from dashcalib_ros.problem.blocks import (
     NOT_SQUARE_NATS,
     Block,
     Imaging,
-    Lens,
+    SharedBlock,
     Shift,
-    Smooth,
     bounds_of,
 )
 from dashcalib_ros.problem.quadratic import Quadratic
@@ -139,10 +138,10 @@ def _with_sizes_chosen(now: Estimate, loss_px: float) -> Estimate:
     total = total.at_noise(now.inflation)
     smooth, width = now.imaging.smooth, now.camera.image_size[0]
     fields = [replace(smooth, sigma=size * width / 1000) for size in FIELD_SIZES]
-    now = now.having(_likeliest(total, now.imaging, fields))
+    now = now.having(likeliest(total, now.imaging, fields))
     square = replace(now.imaging.lens, aspect_sigma=now.config.intrinsics.aspect_sigma)
     loose = replace(square, aspect_sigma=NOT_SQUARE)
-    return now.having(square if square.aspect_sigma >= NOT_SQUARE else _likeliest(
+    return now.having(square if square.aspect_sigma >= NOT_SQUARE else likeliest(
         total, now.imaging, [square, loose], NOT_SQUARE_NATS))
 
 
@@ -167,7 +166,7 @@ def inflation_of(total: Quadratic, prior: Quadratic) -> float:
     return max(1.0, float(np.sum(inverse * total.by_track) / np.sum(inverse * total.hessian)))
 
 
-def _likeliest(total: Quadratic, imaging: Imaging, sizes: Sequence[Smooth] | Sequence[Lens],
+def likeliest(total: Quadratic, imaging: Imaging, sizes: Sequence[SharedBlock],
                least: float = 0.0) -> Block:
     """Return the block with the prior of most evidence; the first one if others lack least nats.
 
@@ -179,7 +178,7 @@ def _likeliest(total: Quadratic, imaging: Imaging, sizes: Sequence[Smooth] | Seq
     return sizes[best if nats[best] > nats[0] + least else 0]
 
 
-def evidence(total: Quadratic, imaging: Imaging, block: Smooth | Lens) -> float:
+def evidence(total: Quadratic, imaging: Imaging, block: SharedBlock) -> float:
     """Return the log of the marginal likelihood, up to a constant, with the prior of a block."""
     cost = Quadratic.together([total, imaging.prior()])
     return block.log_density + 0.5 * float(

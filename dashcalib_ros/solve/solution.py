@@ -27,6 +27,18 @@ CLEAR_KIND_RATIO = 1.08
 
 
 @dataclass(frozen=True)
+class FocalDrift:
+    """By how much the focal length grows from the first turn's begin to the last one's end, of 1.
+
+    With its sigma; seconds: between both.
+    """
+
+    size: float
+    sigma: float
+    seconds: float
+
+
+@dataclass(frozen=True)
 class Solution:
     """All turns adjusted together.
 
@@ -42,7 +54,8 @@ class Solution:
     that it is not first. crops: by turn (k, 2) px, how far a stabiliser moved each keyframe's
     picture; empty for a fixed picture. perhaps_shifted: turns so gentle that a stabiliser might
     have shifted their pictures: each may be, and sigma contains it. fixed: it is known that there
-    is no stabiliser. converged: whether the last
+    is no stabiliser. drift: of the focal length, which is that of the middle of the drive then.
+    converged: whether the last
     steps reached the optimum. field_sigma: px, of the prior of the field's directions.
     by_pictures: the solution of the pictures alone, where a gyro's angles are in this one. px: of
     the input's pictures, in one pixel of the scenes.
@@ -63,6 +76,7 @@ class Solution:
     crops: Mapping[TurnId, Floats] = default(default_factory=dict)
     perhaps_shifted: frozenset[TurnId] = frozenset()
     fixed: bool = False
+    drift: FocalDrift | None = None
     converged: bool = True
     field_sigma: float = 0.0
     by_pictures: Solution | None = None
