@@ -249,8 +249,8 @@ def _warnings(found: CalibrationData, solution: Solution) -> tuple[Notice, ...]:
         warnings.append(Notice(
             'E-FOCAL-LENGTH-DRIFT',
             f'the focal length changes by {drift.from_first_to_last_percent:+.2f} % from the '
-            f'first turn to the last ({drift.fx_percent_per_hour:+.1f} ± {drift.sigma:.1f} % an hour), '
-            f'as of a lens that warms up: camera_info is that of the middle of the drive'))
+            f'first turn to the last ({drift.fx_percent_per_hour:+.1f} ± {drift.sigma:.1f} % an '
+            f'hour), as of a lens that warms up: camera_info is that of the middle of the drive'))
     if found.mount is not None and found.mount.moved_s is not None:
         warnings.append(Notice(
             'E-CAMERA-MOVED',

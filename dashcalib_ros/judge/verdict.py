@@ -633,6 +633,6 @@ ENOUGH: tuple[Rule, ...] = (
 # whether anything contradicts the result
 SOUND: tuple[Rule, ...] = (
     turns_disagree, other_camera, _not_fixed, _drifts, _uneven_times, _strange_aspect,
-    _strange_shutter, _on_bound, _folds_over, _other_model, _other_kind, _moves_sideways, _turned_pictures,
-    _lines_disagree, _sensors_disagree, _two_cameras)
+    _strange_shutter, _on_bound, _folds_over, _other_model, _other_kind, _moves_sideways,
+    _turned_pictures, _lines_disagree, _sensors_disagree, _two_cameras)
 RULES = (*ENOUGH, *SOUND)
