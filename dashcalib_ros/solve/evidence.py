@@ -25,7 +25,7 @@ from dashcalib_ros.problem.blocks import Bend, Block, Drift, ImageBlock, Shift, 
 from dashcalib_ros.problem.normal import Normal, linearised, normal_equations
 from dashcalib_ros.problem.quadratic import Quadratic
 from dashcalib_ros.reconstruct.scene import errors_px
-from dashcalib_ros.solve.optimise import FIRST_TRACKS, Estimate, likeliest
+from dashcalib_ros.solve.optimise import FIRST_TRACKS, TEST_LOSS, Estimate, likeliest
 
 Kind = Literal['shift', 'zoom', 'bend']
 
@@ -38,8 +38,6 @@ ROLLING, ONE_TURN = 1.35, 1.5
 LEFT_SHIFT = 4.0
 # what matters: of the width; of 1; px of 1000 px of width
 MATTERS: Mapping[Kind, float] = {'shift': 0.004, 'zoom': 0.004, 'bend': 0.3}
-# times the loss of the solution: what a picture that moves leaves is in the tails
-TEST_LOSS = 2.0
 # sigmas of a slow shift, of the width, among which the evidence chooses, and the nats it takes
 SHIFT_SIZES, SHIFT_NATS = (0.0005, 0.001, 0.002, 0.004, 0.008, 0.016), 3.0
 # degrees of yaw: a stabiliser hides less in a stretch; more shows whether there is one

@@ -25,6 +25,9 @@ from dashcalib_ros.reconstruct.scene import Scene, errors_px, retriangulated
 
 # rendered images without noise would make the loss cut off everything
 LEAST_LOSS_PX = 0.05
+# times the loss of the solution: what another camera, or a picture that moves, leaves is in the
+# tails
+TEST_LOSS = 2.0
 # of each turn, where a part of its tracks is enough
 FIRST_TRACKS = 200
 # of points with fixed poses: Gauss-Newton steps, and the damping of their blocks
@@ -240,6 +243,6 @@ def subsample_tracks(scene: Scene, wanted: int) -> Scene:
 
 
 def loss_px_of(scenes: Sequence[Scene], camera: Camera, config: IntrinsicsConfig) -> float:
-    """Return the scale of the Cauchy loss: config.loss times the median residual, px."""
+    """Return the scale of the Cauchy loss for a camera that may be wrong, px."""
     errors = np.concatenate([errors_px(scene, camera)[scene.structure.used] for scene in scenes])
-    return max(config.loss * float(np.median(errors)), LEAST_LOSS_PX)
+    return max(TEST_LOSS * config.loss * float(np.median(errors)), LEAST_LOSS_PX)

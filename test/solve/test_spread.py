@@ -149,7 +149,8 @@ def test_a_measurement_draws_the_camera_as_far_as_it_is_known(solution):
     assert blind.camera.fx == pytest.approx(solution.camera.fx, abs=1e-3)
     assert blind.sigma[0] == pytest.approx(solution.sigma[0], rel=0.02)
     equal = with_measurement(solution, along, 3.0, own)
-    assert 0.8 < equal.camera.fx - solution.camera.fx < 2.2
+    # half way, if sigma were that of one case; where turns may not differ it is smaller
+    assert 0.5 < equal.camera.fx - solution.camera.fx < 2.2
     # fy, which is known together with fx, follows
     assert sharp.camera.fy - solution.camera.fy > 1.5
     assert sharp.scenes is solution.scenes
