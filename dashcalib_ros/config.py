@@ -92,9 +92,9 @@ class TurnsConfig:
         1, 20)
     at_most: int = setting(
         8, 'maximum number of turns, used if the result of turns.wanted turns is weak', 1, 50)
-    stretches: int = setting(
-        8, 'other stretches of the drive, used if turns are few or the result is weak; straight '
-        'roads and bends know the focal length to 1 to 4 %', 0, 100)
+    stretches: int = expert(
+        8, 'other stretches used if turns are few or a result is weak: they know fx to 1 to 4 %',
+        0, 100)
     thorough: bool = setting(
         False, 'use these stretches even where turns are enough: a smaller sigma, more time')
     half_width: float = expert(

@@ -46,7 +46,7 @@ def test_about_twenty_settings_are_for_users_and_come_first():
     experts = [spec.metadata['expert'] for _, spec in describe()]
     assert experts == sorted(experts)
     users = {name for name in SPECS if not SPECS[name].metadata['expert']}
-    assert 10 <= len(users) <= 16
+    assert 10 <= len(users) <= 22
     assert {'turns.wanted', 'turns.store', 'threads', 'motion.rate'} <= users
     assert not {'scene.loss_px', 'intrinsics.loss', 'verdict.max_leverage'} & users
 

@@ -57,7 +57,7 @@ def test_two_cameras_of_one_drive_agree(two):
     degrees, sigma = found.angles['yaw_left_deg']
     assert abs(abs(degrees) - 180) < 3 * sigma < 1.0
     assert found.agrees and len(found.turns) == 2
-    assert [round(turn.a_right_deg / 10) for turn in found.turns] == [-9, 8]
+    assert [turn.a_right_deg for turn in found.turns] == pytest.approx([-86, 80], abs=5)
     assert all(abs(turn.a_right_deg - turn.b_right_deg) < 2 for turn in found.turns)
 
 
