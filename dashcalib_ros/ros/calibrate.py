@@ -2,6 +2,7 @@
 """The program that calibrates: what is accepted is published beside the images, and kept."""
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 from sensor_msgs.msg import CameraInfo
@@ -199,7 +200,8 @@ class Calibrating:
             if self._commit is not None:
                 self._commit.end()
             self._commit = Commit(self._endpoints, info, self._own.commit_timeout,
-                                  driver_services(self._endpoints.node, self.drive.images))
+                                  partial(driver_services, self._endpoints.node,
+                                          self.drive.images))
 
     def _give_up(self) -> None:
         self._retire()

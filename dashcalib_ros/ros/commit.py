@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from rclpy.node import Node
@@ -25,12 +25,15 @@ class Commit:
     """
 
     def __init__(self, endpoints: Endpoints, info: CameraInfo, timeout_s: float,
-                 names: Sequence[str]) -> None:
-        """names: of services, of which the first that there is is called."""
-        node = self._node = endpoints.node
+                 names: Callable[[], Sequence[str]]) -> None:
+        """names: of services, of which the first that there is is called.
+
+        They are looked up again and again: a publisher may be seen before its node's name is.
+        """
+        self._node = endpoints.node
         self._log, self._info, self._timeout_s = endpoints.log, info, timeout_s
-        self._clients = {name: node.create_client(SetCameraInfo, name) for name in names}
-        self._name = ' or '.join(names)
+        self._names, self._clients = names, dict[str, Any]()
+        self._name = ''
         self._answer: Any = None
         self._deadline = time.monotonic() + timeout_s
         self._end_timer = endpoints.timer(LOOK_S, self._look)
@@ -43,15 +46,20 @@ class Commit:
             self._node.destroy_client(self._clients.popitem()[1])
 
     def _look(self) -> None:
-        for name, client in self._clients.items():
+        names = self._names() if self._answer is None else ()
+        for name in names:
+            if name not in self._clients:
+                self._clients[name] = self._node.create_client(SetCameraInfo, name)
+        for name in names:
+            client = self._clients[name]
             if self._answer is None and client.service_is_ready():
                 self._name = name
                 self._answer = client.call_async(SetCameraInfo.Request(camera_info=self._info))
         answered = self._answer is not None and self._answer.done()
         if not answered and time.monotonic() < self._deadline:
             return
+        name = self._name or ' or '.join(names)
         self.end()
-        name = self._name
         if self._answer is None:
             trouble = f'there is no service {name}'
         elif not answered:

@@ -36,6 +36,7 @@ from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge import TurnSummary, Verdict
 from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.report import Calibration
+from dashcalib_ros.ros import calibrate
 from dashcalib_ros.ros.background import Moved, Result, Trouble
 from dashcalib_ros.ros.store import CameraIdentity, Store
 from dashcalib_ros.store.turn_store import Origin, StoredTurn, TurnStore
@@ -306,6 +307,27 @@ def test_the_driver_s_service_is_looked_for_beside_the_images(make_desk, capfd, 
     said = []
     desk.until(lambda: said.append(capfd.readouterr().err) or words in ''.join(said))
     assert len(asked) == called
+
+
+def test_a_driver_whose_name_is_seen_late_is_found(make_desk, capfd, monkeypatch):
+    desk, asked, looks = make_desk(commit='true', commit_timeout=30.0), [], []
+    real = calibrate.driver_services
+
+    def late(*arguments):
+        looks.append(True)
+        return real(*arguments) if len(looks) > 3 else ()
+
+    def take(request, response):
+        asked.append(request)
+        response.success = True
+        return response
+    monkeypatch.setattr(calibrate, 'driver_services', late)
+    desk.bench.node.create_service(SetCameraInfo, '/bench/set_camera_info', take)
+    desk.give()
+    said = []
+    desk.until(lambda: said.append(capfd.readouterr().err)
+               or '/bench/set_camera_info accepted' in ''.join(said))
+    assert len(asked) == 1 and len(looks) > 3
 
 
 KEPT = """\
