@@ -217,9 +217,10 @@ class Detection:
 
 
 def detect(frames: Iterable[Frame], config: Config, mask: Mask | None = None) -> Detection:
-    """Find the turns of a drive, and no other stretches. For a stream, call Detection.push() for each frame.
+    """Find the turns of a drive. For a stream, call Detection.push() for each frame.
 
-    mask: (h, w), False on the ego vehicle. Raises InputError as Detection.push() does.
+    No other stretches are kept. mask: (h, w), False on the ego vehicle. Raises InputError as
+    Detection.push() does.
     """
     detection = Detection(config, mask, stretches=False)
     for frame in frames:
