@@ -17,7 +17,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.errors import InputError, Notice, one_line, shortened
-from dashcalib_ros.input import novatek
+from dashcalib_ros.input import camm, novatek
 from dashcalib_ros.input.inputs import is_video
 from dashcalib_ros.input.motion import (
     DOUBT_S,
@@ -328,6 +328,8 @@ def _inside_video(path: Path) -> SensorStream:
             return replace(sensor_stream({'position': (rows[:, 0], rows[:, 1:4]),
                                           'speed': (rows[:, 0], rows[:, 4:])}, str(path)),
                            doubt_s=DOUBT_S)
+        if found_inside := camm.streams(path):
+            return sensor_stream(found_inside, str(path))
     except OSError as error:
         raise os_error(path, error) from error
     try:

@@ -29,8 +29,8 @@ def fixes(path: Path) -> list[tuple[float, ...]]:
     """
     with path.open('rb') as file:
         size = file.seek(0, 2)
-        places = [(at, end) for name, first, last in _boxes(file, 0, size) if name == b'moov'
-                  for inner, at, end in _boxes(file, first, last) if inner == b'gps ']
+        places = [(at, end) for name, first, last in boxes(file, 0, size) if name == b'moov'
+                  for inner, at, end in boxes(file, first, last) if inner == b'gps ']
         blocks = [_block(file, *each) for at, end in places[:1]
                   for each in _listed(file, at, end)]
     known = [(second, *block) for second, block in enumerate(blocks) if block is not None]
@@ -39,7 +39,7 @@ def fixes(path: Path) -> list[tuple[float, ...]]:
             ] if known else []
 
 
-def _boxes(file: BinaryIO, at: int, end: int) -> Iterator[tuple[bytes, int, int]]:
+def boxes(file: BinaryIO, at: int, end: int) -> Iterator[tuple[bytes, int, int]]:
     """Yield name, first and last byte of the content of each box between two places."""
     for _ in range(BOXES):
         file.seek(at)

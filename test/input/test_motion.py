@@ -14,7 +14,7 @@ from made_gopro import gopro
 from refused import refused
 
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.input import novatek
+from dashcalib_ros.input import camm, novatek
 from dashcalib_ros.input.inputs import open_frames
 from dashcalib_ros.input.motion import (
     DEGREE_M,
@@ -640,3 +640,60 @@ def test_a_damaged_video_of_novatek_s_is_read_as_far_as_it_goes(tmp_path):
     assert len(novatek.fixes(path)) == 27
     path.write_bytes(b'')
     assert novatek.fixes(path) == []
+
+
+def camm_video(path, samples, scale=1000, step=100):
+    """Write an MP4 with a track of CAMM, two samples in a chunk."""
+    def box(name, data):
+        return struct.pack('>I4s', 8 + len(data), name) + data
+
+    def table(name, data):
+        return box(name, bytes(4) + data)
+
+    head = box(b'ftyp', b'isom' + bytes(4))
+    sizes = [len(each) for each in samples]
+    starts = [len(head) + 8 + sum(sizes[:n]) for n in range(0, len(samples), 2)]
+    stbl = box(b'stbl', b''.join([
+        table(b'stsd', struct.pack('>I', 1) + struct.pack('>I4s', 16, b'camm') + bytes(8)),
+        table(b'stts', struct.pack('>3I', 1, len(samples), step)),
+        table(b'stsc', struct.pack('>4I', 1, 1, 2, 1)),
+        table(b'stsz', struct.pack(f'>2I{len(sizes)}I', 0, len(sizes), *sizes)),
+        table(b'stco', struct.pack(f'>I{len(starts)}I', len(starts), *starts))]))
+    mdhd = table(b'mdhd', struct.pack('>5I', 0, 0, scale, 0, 0))
+    trak = box(b'trak', box(b'mdia', mdhd + box(b'minf', stbl)))
+    other = box(b'trak', box(b'mdia', box(b'minf', box(b'stbl', table(
+        b'stsd', struct.pack('>I', 1) + struct.pack('>I4s', 16, b'avc1') + bytes(8))))))
+    path.write_bytes(head + box(b'mdat', b''.join(samples)) + box(b'moov', other + trak))
+    return path
+
+
+def camm_samples():
+    samples = []
+    for n in range(40):
+        samples.append(struct.pack('<2H3f', 0, 2, 0.1, 0.2, 0.01 * n))
+        samples.append(struct.pack('<2Hdi2d7f', 0, 6, 1.4e9 + n, 0 if n < 2 else 3, 48.0,
+                                   11.0 + 1e-4 * n, 500.0, 1, 1, 3.0, 4.0, 0.0, 1))
+        samples.append(struct.pack('<2H3f', 0, 3, 0.0, 0.0, 9.8))
+    return samples
+
+
+def test_gyro_and_gps_of_a_camm_track(tmp_path):
+    stream = read_motion(camm_video(tmp_path / 'a.mp4', camm_samples()))
+    assert not stream.absolute
+    np.testing.assert_allclose(stream.rate.stamps_s, 0.3 * np.arange(40), atol=1e-9)
+    np.testing.assert_allclose(stream.rate.values[:, 2], 0.01 * np.arange(40), atol=1e-6)
+    # two without a fix
+    np.testing.assert_allclose(stream.position.stamps_s, 0.3 * np.arange(2, 40) + 0.1)
+    np.testing.assert_allclose(stream.speed.values, 5.0)
+    short = [struct.pack('<2H3d', 0, 5, 48.0, 11.0 + 1e-4 * n, 500.0) for n in range(20)]
+    assert len(camm.streams(camm_video(tmp_path / 'b.mp4', short))['position'][0]) == 20
+
+
+def test_a_damaged_camm_track_is_read_as_far_as_it_goes(tmp_path):
+    path = camm_video(tmp_path / 'a.mp4', [*camm_samples(), b'', b'\0', struct.pack(
+        '<2H', 0, 2), struct.pack('<2H', 0, 99)])
+    assert len(camm.streams(path)['rate'][0]) == 40
+    whole = path.read_bytes()
+    for cut in range(10, len(whole), 97):
+        path.write_bytes(whole[:cut])
+        camm.streams(path)
