@@ -7,6 +7,7 @@ type, and numbers; its time is that of the track.
 from __future__ import annotations
 
 import struct
+from bisect import bisect_right
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO
@@ -23,8 +24,8 @@ NUMBERS = {GYRO: struct.Struct('<3f'), GPS_SHORT: struct.Struct('<3d'),
            GPS: struct.Struct('<di2d7f')}
 # samples of a track, and bytes of a table
 SAMPLES, TABLE_BYTES = 10_000_000, 256 * 2**20
-# boxes on the way from the file to the tables of a track
-INSIDE = {b'moov', b'trak', b'mdia', b'minf', b'stbl'}
+# boxes on the way from a track to its tables, in this order: nothing else is entered
+WAY = (b'mdia', b'minf', b'stbl')
 TABLES = {b'stsd', b'stts', b'stsz', b'stsc', b'stco', b'co64', b'mdhd'}
 
 
@@ -59,35 +60,40 @@ def _samples(file: BinaryIO, size: int) -> Iterator[tuple[float, bytes]]:
         for inner, at, end in boxes(file, first, last) if name == b'moov' else ():
             tables = _tables(file, at, end) if inner == b'trak' else {}
             if tables.get(b'stsd', b'')[12:16] == b'camm':
-                yield from _of_track(file, tables)
+                yield from _of_track(file, size, tables)
                 return
 
 
-def _tables(file: BinaryIO, at: int, end: int) -> dict[bytes, bytes]:
+def _tables(file: BinaryIO, at: int, end: int, way: tuple[bytes, ...] = WAY
+            ) -> dict[bytes, bytes]:
     """Return the tables of a track, each without its head."""
     found: dict[bytes, bytes] = {}
     for name, first, last in boxes(file, at, end):
-        if name in INSIDE:
-            found |= _tables(file, first, last)
+        if name in way[:1]:
+            found |= _tables(file, first, last, way[1:])
         elif name in TABLES:
             file.seek(first)
             found[name] = file.read(min(last - first, TABLE_BYTES))
     return found
 
 
-def _of_track(file: BinaryIO, tables: Mapping[bytes, bytes]) -> Iterator[tuple[float, bytes]]:
+def _of_track(file: BinaryIO, length: int, tables: Mapping[bytes, bytes]
+              ) -> Iterator[tuple[float, bytes]]:
     head = tables.get(b'mdhd', b'')
     if len(head) < 24 or b'stsz' not in tables:
         return
     scale = struct.unpack_from('>I', head, 20 if head[0] else 12)[0]
     one, count = struct.unpack_from('>2I', tables[b'stsz'].ljust(12, b'\0'), 4)
-    sizes = [one] * min(count, SAMPLES) if one else [
-        each for each, in struct.iter_unpack('>I', _whole(tables[b'stsz'][12:], 4))]
+    # a count without a table may be any number: no more than fit into the file
+    sizes = [one] * min(count, SAMPLES, length // one) if one else [
+        each for each, in struct.iter_unpack(
+            '>I', _whole(tables[b'stsz'][12:12 + 4 * SAMPLES], 4))]
     wide = b'co64' in tables
     chunks = [each for each, in struct.iter_unpack(
         '>Q' if wide else '>I',
         _whole(tables.get(b'co64' if wide else b'stco', b'')[8:], 8 if wide else 4))]
     runs = list(struct.iter_unpack('>3I', _whole(tables.get(b'stsc', b'')[8:], 12)))
+    starts = [run[0] for run in runs]
     times, ticks = list[float](), 0
     for number, step in struct.iter_unpack('>2I', _whole(tables.get(b'stts', b'')[8:], 8)):
         for _ in range(min(number, len(sizes) - len(times))):
@@ -95,7 +101,8 @@ def _of_track(file: BinaryIO, tables: Mapping[bytes, bytes]) -> Iterator[tuple[f
             ticks += step
     sample = 0
     for place, offset in enumerate(chunks, start=1):
-        each = next((run[1] for run in reversed(runs) if run[0] <= place), 0)
+        run = bisect_right(starts, place) - 1
+        each = runs[run][1] if run >= 0 else 0
         for _ in range(each):
             if sample >= min(len(sizes), len(times)):
                 return

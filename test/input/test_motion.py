@@ -697,3 +697,20 @@ def test_a_damaged_camm_track_is_read_as_far_as_it_goes(tmp_path):
     for cut in range(10, len(whole), 97):
         path.write_bytes(whole[:cut])
         camm.streams(path)
+
+
+def test_a_hostile_camm_track_is_bounded_by_its_file(tmp_path):
+    path = tmp_path / 'a.mp4'
+    path.write_bytes(struct.pack('>I4s', 0, b'moov') + 3000 * struct.pack('>I4s', 0, b'trak'))
+    assert not camm.streams(path)
+    data = camm_video(path, [struct.pack('<2H3f', 0, 2, 0, 0, 1)] * 2).read_bytes()
+    most = 2**32 - 1
+    for old, new in [(struct.pack('>2I', 0, 2) + 2 * struct.pack('>I', 16),
+                      struct.pack('>4I', 16, most, 16, 16)),
+                     (struct.pack('>3I', 1, 2, 100), struct.pack('>3I', 1, most, 100)),
+                     (struct.pack('>4I', 1, 1, 2, 1), struct.pack('>4I', 1, 1, most, 1))]:
+        assert data.count(old) == 1
+        data = data.replace(old, new)
+    path.write_bytes(data)
+    with path.open('rb') as file:
+        assert 2 <= sum(1 for _ in camm._samples(file, len(data))) <= len(data) // 16
