@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The path of a camera: poses at knots, and between them value and velocity at any time.
+"""The path of a camera through the poses of its keyframes: how fast it turns and moves at each.
 
 A cubic spline goes through the centres of the camera, and one through the rotation vectors from
-the knot that is nearest. A row of a rolling shutter, a second camera with a clock of its own and
-a gyro ask for it at times of their own.
+each keyframe to all. The rows of a rolling shutter are exposed along it.
 """
 from __future__ import annotations
 
@@ -13,24 +12,9 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Ints, Mask
-from dashcalib_ros.camera.rotation import rotation_matrices
 
 # knots at the least, from which a spline says how the camera moved
 LEAST_KNOTS = 4
-
-
-@dataclass(frozen=True)
-class Moment:
-    """Pose and velocity at n times.
-
-    rotations: (n, 3, 3), translations: (n, 3): world to camera. turning: (n, 3) rad/s, moving:
-    (n, 3) a second: a point X in the camera's axes moves by turning x X + moving.
-    """
-
-    rotations: Floats
-    translations: Floats
-    turning: Floats
-    moving: Floats
 
 
 @dataclass(frozen=True)
@@ -80,50 +64,13 @@ class Trajectory:
             moving[self.rows] = -np.einsum('kab,kb->ka', self.rotations, slopes @ self._centres)
         return turning, moving
 
-    def at(self, seconds: Floats) -> Moment:
-        """Return pose and velocity at times (n,), s after the first knot.
-
-        Raises ValueError where the knots do not say how the camera moves.
-        """
-        near, value, slope, angle, rate = self._splined(seconds)
-        rotations = rotation_matrices(angle) @ self.rotations[near]
-        turning = np.einsum('nab,nb->na', _left(angle), rate)
-        return Moment(
-            rotations, -np.einsum('nab,nb->na', rotations, value @ self._centres), turning,
-            -np.einsum('nab,nb->na', rotations, slope @ self._centres))
-
-    def by_knots(self, seconds: Floats) -> tuple[Floats, Floats]:
-        """Return (n, 6, k, 6) derivatives of pose and velocity at times (n,) by the knots' moves.
-
-        A move of a pose is a small rotation in its own axes, and of its translation. Velocity:
-        of turning and moving.
-        """
-        near, value, slope, angle, rate = self._splined(seconds)
-        now, each = self.at(seconds), np.arange(len(near))
-        left = _left(angle)
-        by_angle = self._by_turns(near, value)
-        pose, velocity = np.zeros((2, len(near), 6, len(self.seconds), 6))
-        pose[:, :3, :, :3] = np.einsum('nab,nbjc->najc', left, by_angle)
-        pose[each, :3, near, :3] += rotation_matrices(angle)
-        velocity[:, :3, :, :3] = (
-            np.einsum('nab,nbjc->najc', left, self._by_turns(near, slope))
-            + np.einsum('nab,nbjc->najc', _left_by(angle, rate), by_angle))
-        # of minus the centre, in the world's axes, by each knot's move
-        back = self.rotations.transpose(0, 2, 1)
-        shifted = np.concatenate([back @ cross(self.translations), back], axis=2)
-        for found, weights, vector in ((pose, value, now.translations),
-                                       (velocity, slope, now.moving)):
-            found[:, 3:] = np.einsum('nab,nj,jbc->najc', now.rotations, weights, shifted)
-            found[:, 3:] -= np.einsum('nab,nbjc->najc', cross(vector), pose[:, :3])
-        return pose, velocity
-
     def follow(self) -> Floats:
         """Return (count, 6, count, 6) derivatives of the keyframes' velocities by their moves."""
         found = np.zeros((self.count, 6, self.count, 6))
         if self.moves:
             slopes, each = _slopes(tuple(self.seconds.tolist())), np.arange(len(self.seconds))
             inner = np.zeros((len(each), 6, len(each), 6))
-            inner[:, :3, :, :3] = self._by_turns(each, slopes)
+            inner[:, :3, :, :3] = self._by_turns(slopes)
             # [k, j]: from the axes of knot j to those of k
             weighted = slopes[:, :, None, None] * self._relative.transpose(0, 1, 3, 2)
             inner[:, 3:, :, 3:] = weighted.transpose(0, 2, 1, 3)
@@ -132,27 +79,14 @@ class Trajectory:
             found[np.ix_(self.rows, np.arange(6), self.rows, np.arange(6))] = inner
         return found
 
-    def _by_turns(self, near: Ints, weights: Floats) -> Floats:
-        """Return (n, 3, k, 3) derivatives of weighted (n, k) angles from knots near by turns."""
-        turned = cross(self._angles[near].reshape(-1, 3)).reshape(*weights.shape, 3, 3)
+    def _by_turns(self, weights: Floats) -> Floats:
+        """Return (k, 3, k, 3) derivatives of weighted (k, k) angles from each knot, by turns."""
+        turned = cross(self._angles.reshape(-1, 3)).reshape(*weights.shape, 3, 3)
         # of the vector of a rotation by one more small rotation, to the third order; gauge-free
         by_turn = weights[:, :, None, None] * (np.eye(3) - turned / 2 + turned @ turned / 12)
-        found = by_turn.transpose(0, 2, 1, 3).copy()
-        found[np.arange(len(near)), :, near] -= np.sum(by_turn @ self._relative[near], axis=1)
+        found, each = by_turn.transpose(0, 2, 1, 3).copy(), np.arange(len(weights))
+        found[each, :, each] -= np.sum(by_turn @ self._relative, axis=1)
         return np.asarray(found)
-
-    def _splined(self, seconds: Floats) -> tuple[Ints, Floats, Floats, Floats, Floats]:
-        """Return the nearest knot, weights of values and slopes, the angle from it and its rate.
-
-        (n,), (n, k), (n, k), (n, 3) and (n, 3).
-        """
-        if not self.moves:
-            raise ValueError('too few knots for a trajectory')
-        near = np.abs(seconds[:, None] - self.seconds).argmin(axis=1)
-        value, slope = _weights(tuple(self.seconds.tolist()), seconds)
-        angles = self._angles[near]
-        return (near, value, slope, np.einsum('nk,nkc->nc', value, angles),
-                np.einsum('nk,nkc->nc', slope, angles))
 
 
 @lru_cache(maxsize=64)
@@ -175,38 +109,6 @@ def _slopes(knots: tuple[float, ...]) -> Floats:
         left[end, end], left[end, next_one] = k, h + k
         right[end] = ((3 * h + 2 * k) * k * a + h * h * b) / (h + k)
     return np.asarray(np.linalg.solve(left, right))
-
-
-def _weights(knots: tuple[float, ...], seconds: Floats) -> tuple[Floats, Floats]:
-    """Return (n, k) the spline's values and its slopes at times (n,), by the values at all knots.
-
-    Beyond the ends the outer pieces go on.
-    """
-    times, slopes, unit = np.array(knots), _slopes(knots), np.eye(len(knots))
-    piece = np.clip(np.searchsorted(times, seconds, side='right') - 1, 0, len(times) - 2)
-    step = (times[piece + 1] - times[piece])[:, None]
-    u = (seconds - times[piece])[:, None] / step
-    a, b = unit[piece], unit[piece + 1]
-    da, db = step * slopes[piece], step * slopes[piece + 1]
-    value = ((1 + 2 * u) * (1 - u)**2 * a + u * (1 - u)**2 * da
-             + u**2 * (3 - 2 * u) * b + u**2 * (u - 1) * db)
-    slope = (6 * u * (1 - u) * (b - a) + (1 - u) * (1 - 3 * u) * da
-             + u * (3 * u - 2) * db) / step
-    return value, slope
-
-
-def _left(vectors: Floats) -> Floats:
-    """Return (n, 3, 3) how the rotation of vectors (n, 3) turns with them, to the second order."""
-    turned = cross(vectors)
-    return np.asarray(np.eye(3) + turned / 2 + turned @ turned / 6)
-
-
-def _left_by(vectors: Floats, rates: Floats) -> Floats:
-    """Return (n, 3, 3) derivatives of _left(v) r by v."""
-    turned, rate = cross(vectors), cross(rates)
-    # of v x (v x r): -(v x r) x - v x (r x)
-    twice = -cross(np.einsum('nab,nb->na', turned, rates)) - turned @ rate
-    return np.asarray(-rate / 2 + twice / 6)
 
 
 def cross(vectors: Floats) -> Floats:

@@ -135,8 +135,7 @@ def _solved(per_turn: Sequence[Scene], config: Config, progress: Progress) -> So
     best = _with_all_tracks(best, measured, config)
     if not best.scenes:
         return None
-    for steps in LAST_STEPS:
-        best = optimised(best.retriangulated(), 0.0, steps)
+    best = _finished(best)
     # now, as shifts of pictures may make up for another lens
     if _of_another_drive(best):
         return _solved([scene for scene in per_turn if scene.turn.of_this_drive], config, progress)
@@ -300,8 +299,7 @@ def _steadied(found: Estimate, per_turn: Mapping[TurnId, Scene], config: Config)
     if near is None:
         return found
     now = _with_all_tracks(near, per_turn, config)
-    for steps in LAST_STEPS if now.scenes else ():
-        now = optimised(now.retriangulated(), 0.0, steps)
+    now = _finished(now) if now.scenes else now
     return now if len(now.scenes) == len(found.scenes) else found
 
 
@@ -310,10 +308,14 @@ def _with(found: Estimate, block: Block) -> Estimate:
 
     What it may do to the lens cannot be excluded, and sigma contains it.
     """
-    now = found.having(block)
+    return _finished(found.having(block))
+
+
+def _finished(found: Estimate) -> Estimate:
+    """Return the optimum of all blocks with all tracks, from a state that is near it."""
     for steps in LAST_STEPS:
-        now = optimised(now.retriangulated(), 0.0, steps)
-    return now
+        found = optimised(found.retriangulated(), 0.0, steps)
+    return found
 
 
 def _perhaps_shifted(found: Estimate) -> frozenset[TurnId]:

@@ -170,7 +170,7 @@ def inflation_of(total: Quadratic, prior: Quadratic) -> float:
 
 
 def likeliest(total: Quadratic, imaging: Imaging, sizes: Sequence[SharedBlock],
-               least: float = 0.0) -> Block:
+              least: float = 0.0) -> Block:
     """Return the block with the prior of most evidence; the first one if others lack least nats.
 
     The evidence is the marginal likelihood: all else is at its optimum. total: of all turns, at
