@@ -133,13 +133,13 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
     scenes = {turn.scene.turn: turn.scene for turn in evidence.stored} | evidence.built
     if solution is not None:
         solution = replace(solution, px=evidence.scale.px)
-        scenes |= {scene.turn: scene for scene in solution.scenes}
     lines = spared('the check of straight lines', lost, straight_lines, solution, evidence)
     witnesses, known = evidence.sensors.witnesses, tuple[Known, ...]()
     if solution is not None:
-        informed = spared('what is known before', lost, with_known, solution, config.known,
+        informed = spared('what is known before', lost, with_known, solution, config,
                           evidence.scale.px)
         solution, known = informed or (solution, known)
+        scenes |= {scene.turn: scene for scene in solution.scenes}
     found = CalibrationData(
         verdict=(judge(solution, config.verdict, lines, True, witnesses, evidence.other_camera)
                  if solution else _verdict_without_solution(evidence, config.verdict)),

@@ -4,43 +4,51 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.config import KnownConfig
+from dashcalib_ros.config import Config
 from dashcalib_ros.judge.calibration import Known
 from dashcalib_ros.solve.solution import Solution, with_measurement
 
-# sigmas; knowledge that is farther from what the turns say does not count
-CONTRADICTED = 3.0
+# sigmas; knowledge that is farther from what the turns say, or one turn, does not count
+CONTRADICTED, CONTRADICTED_BY_ONE = 3.0, 6.0
 # of what is given without a sigma: of a value; s of a shutter
 EXACT, EXACT_S = 1e-4, 1e-5
 # of a parameter, for differences
 STEP = 1e-5
 
 
-def with_known(solution: Solution, config: KnownConfig, px: float
+def with_known(solution: Solution, config: Config, px: float
                ) -> tuple[Solution, tuple[Known, ...]]:
     """Return the solution with what is known, and what each piece of it contributed.
 
     px: of the input's pictures, in one pixel of the solution.
     """
+    # pycolmap may start here: the node imports this module, and must not
+    from dashcalib_ros.solve.start import scene_with
     found = []
-    for name, text in (('fx', config.fx), ('hfov', config.hfov), ('aspect', config.aspect),
-                       ('shutter', config.shutter)):
+    for name in ('fx', 'hfov', 'aspect', 'shutter'):
+        text = getattr(config.known, name)
         if not text:
             continue
         value, sigma = _value(text, name)
         own, along = _by_turns(solution, name, px)
         variance = float(along @ solution.posterior.covariance @ along)
-        used = abs(value - own) <= CONTRADICTED * float(np.hypot(sigma, np.sqrt(variance)))
+        limit = CONTRADICTED if len(solution.scenes) > 1 else CONTRADICTED_BY_ONE
+        used = abs(value - own) <= limit * float(np.hypot(sigma, np.sqrt(variance)))
         before = float(solution.sigma[0])
         if used:
             solution = with_measurement(solution, along, value - own, sigma**2)
         found.append(Known(name, value, sigma, own, float(np.sqrt(variance)), used,
                            px * before, px * float(solution.sigma[0])))
+    if any(piece.used for piece in found):
+        scenes = [scene_with(solution.camera, scene, config) for scene in solution.scenes]
+        solution = replace(solution, scenes=tuple(
+            new or old for new, old in zip(scenes, solution.scenes, strict=True)))
     return solution, tuple(found)
 
 

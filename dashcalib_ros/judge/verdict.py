@@ -231,12 +231,10 @@ def profile_contrast(solution: Solution) -> float:
 
 
 def _far_from_profile(grounds: Grounds) -> Finding | None:
-    # the profile is of the pictures alone
-    solution = grounds.solution.by_pictures or grounds.solution
-    best = solution.around.best * solution.camera.image_size[0]
-    gentle = not _has_turn(solution) and profile_contrast(solution) > -MIN_CONTRAST
-    if gentle or np.isclose(best, solution.camera.fx):
+    solution = grounds.solution
+    if profile_contrast(solution) >= (0.0 if _has_turn(solution) else -MIN_CONTRAST):
         return None
+    best = solution.around.best * solution.camera.image_size[0]
     return Finding('E-TWO-FOCAL-LENGTHS', 'refused',
                    f'two ways to find the focal length contradict each other, as where other '
                    f'traffic fills the pictures: {solution.px * solution.camera.fx:.0f} px and '

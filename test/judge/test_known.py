@@ -2,6 +2,8 @@
 """What somebody knows: it counts by its sigma, and not where the turns contradict it."""
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from solving import CONFIG, scenes_of, solved
 from synthetic import LENS
@@ -10,6 +12,10 @@ from dashcalib_ros.config import Config, KnownConfig
 from dashcalib_ros.errors import ConfigError
 from dashcalib_ros.judge.known import with_known
 from dashcalib_ros.judge.verdict import judge
+
+
+def knowing(**pieces):
+    return replace(CONFIG, known=KnownConfig(**pieces))
 
 
 @pytest.fixture(scope='module')
@@ -21,8 +27,7 @@ def found():
     ('fx', '519.9±0.3', 519.9), ('hfov', '81±0.1', 81.0), ('aspect', '1±0.0001', 1.0),
     ('shutter', 'global', 0.0), ('shutter', '0.1±0.2ms', 1e-4)])
 def test_each_piece_makes_the_camera_better_known(found, name, text, value):
-    known = KnownConfig(**{name: text})
-    informed, [piece] = with_known(found, known, 1.0)
+    informed, [piece] = with_known(found, knowing(**{name: text}), 1.0)
     assert piece.name == name and piece.value == pytest.approx(value)
     if piece.used:
         # which of the cases in sigma is likelier may change a little
@@ -37,18 +42,31 @@ def test_each_piece_makes_the_camera_better_known(found, name, text, value):
 
 
 def test_pixels_of_the_input_count(found):
-    _, [piece] = with_known(found, KnownConfig(fx='1040±10'), 2.0)
+    _, [piece] = with_known(found, knowing(fx='1040±10'), 2.0)
     assert piece.by_turns == pytest.approx(2 * found.camera.fx) and piece.used
 
 
 def test_what_the_turns_contradict_does_not_count(found):
-    informed, [piece] = with_known(found, KnownConfig(fx='600±5'), 1.0)
+    informed, [piece] = with_known(found, knowing(fx='600±5'), 1.0)
     assert not piece.used and informed is found
     assert piece.fx_sigma == piece.fx_sigma_without
 
 
+def test_one_turn_alone_contradicts_less_and_names_no_readout_so_soon(found):
+    def used_and_named(solution, sigmas):
+        readout_s = -sigmas * solution.readout_sigma_s
+        [shutter] = with_known(
+            replace(solution, readout_s=readout_s), knowing(shutter='global'), 1.0)[1]
+        rolling = replace(solution, readout_s=-1e-3 * sigmas, readout_sigma_s=1e-3).rolling
+        return shutter.used, rolling
+
+    alone = solved(scenes_of(1))
+    assert used_and_named(alone, 5) == (True, False)
+    assert used_and_named(alone, 9) == used_and_named(found, 5) == (False, True)
+
+
 def test_nothing_known_is_nothing_changed(found):
-    assert with_known(found, KnownConfig(), 1.0) == (found, ())
+    assert with_known(found, CONFIG, 1.0) == (found, ())
 
 
 @pytest.mark.parametrize(('name', 'text'), [
