@@ -262,11 +262,20 @@ def test_the_stages_by_hand_give_what_the_calibrator_gives(frames, result):
     detection.finish()
     scenes = [reconstruct(turn, QUICK, valid[turn.id]) for turn in detection.turns()]
     solution = solve([scene for scene in scenes if scene is not None], QUICK)
-    by_hand = conclude(solution, evidence_of_detection(detection, scenes), QUICK)
+    evidence = evidence_of_detection(detection, scenes)
+    by_hand = conclude(solution, evidence, QUICK)
     assert by_hand.verdict.level == result.verdict.level
     # where numpy has more than one thread, sums come in another order
     np.testing.assert_allclose(by_hand.camera.params, result.camera.params, rtol=1e-6)
     assert [turn.center for turn in by_hand.turns] == [turn.center for turn in result.turns]
+    # what is known beside them costs no turn, and no verdict
+    sigma = by_hand.sigma['fx']
+    fx = by_hand.camera.fx + sigma
+    informed = conclude(solution, evidence, QUICK.replace({
+        'known.fx': f'{fx:.2f}±{sigma:.2f}'}))
+    assert informed.verdict.level == by_hand.verdict.level and informed.known[0].used
+    assert by_hand.camera.fx < informed.camera.fx < fx
+    assert informed.turns_used == by_hand.turns_used == 2
 
 
 def test_what_fails_beside_the_solution_costs_itself_only(frames, monkeypatch):
