@@ -54,13 +54,15 @@ class Path:
 
     yaw: rad, of the whole turn. seconds: (k,) of the keyframes. bumps: (k, 3) pitch and roll, rad,
     and height, m, at the keyframes. shaking: (k, 3) rad/s, by how much faster each keyframe's
-    camera turns than this path.
+    camera turns than this path. aliased: the bumps are faster than the keyframes, so that no path
+    through these shows how fast the camera pitches and rolls: as shaking says.
     """
 
     yaw: float
     seconds: np.ndarray
     bumps: np.ndarray
     shaking: np.ndarray
+    aliased: bool = False
     radius_m: float = 10.0
 
     @property
@@ -98,7 +100,7 @@ class Path:
         return local + np.cross(self.shaking[:, None] * late_s[..., None], local)
 
     def _bumps(self, seconds: np.ndarray) -> np.ndarray:
-        if np.array_equal(seconds, np.broadcast_to(self.seconds[:, None], seconds.shape)):
+        if self.aliased or np.array_equal(seconds, np.broadcast_to(self.seconds[:, None], seconds.shape)):
             return np.broadcast_to(self.bumps[:, None], (*seconds.shape, 3))
         # it takes half a second to load, and test_rooms.py says where it is not needed
         from scipy.interpolate import CubicSpline
@@ -111,30 +113,34 @@ class Path:
         return (local[:, 1:] - local[:, :1]).transpose(0, 2, 1), local[:, 0]
 
 
-def path_of(yaw_deg: float, seconds: np.ndarray, seed: int, shaking_deg_s: float = 0.0) -> Path:
+def path_of(yaw_deg: float, seconds: np.ndarray, seed: int, shaking_deg_s: float = 0.0,
+            aliased: bool = False) -> Path:
     """Return a turn's path, with random bumps; shaking_deg_s: of pitch and roll."""
     rng, count = np.random.default_rng([seed, 1]), len(seconds)
     bumps = rng.standard_normal((count, 3)) * (*np.radians([0.7, 0.7]), 0.03)
     shaking = np.radians(shaking_deg_s) * rng.standard_normal((count, 3)) * (1, 0, 1)
-    return Path(np.radians(yaw_deg), seconds, bumps, shaking)
+    return Path(np.radians(yaw_deg), seconds, bumps, shaking, aliased)
 
 
 def synthetic_turn(camera: Camera = LENS, yaw_deg: float = 80.0, keyframes: int = 20,
                    tracks: int = 350, noise_px: float = 0.2, outliers: float = 0.0, seed: int = 0,
                    world: int = 0, extra: tuple[float, float, float] = (0.0, 0.0, 0.0),
                    readout_s: float = 0.0, shaking_deg_s: float = 0.0,
-                   keyframe_s: float = KEYFRAME_S, uneven: float = 0.0) -> SyntheticTurn:
+                   keyframe_s: float = KEYFRAME_S, uneven: float = 0.0,
+                   aliased: bool = False) -> SyntheticTurn:
     """Return a turn through random points.
 
     seed: of the noise; world: of the path and the points. outliers: share of the observations that
     are 5 to 40 px off. extra: p1, p2, k3 of the lens that took the pictures.
     readout_s: of a rolling shutter. shaking_deg_s: how fast bumps pitch and roll the camera in
     each keyframe, which no path through the keyframes shows. keyframe_s: between two keyframes;
-    uneven: of it, up to which their true times differ from the even ones that they have.
+    uneven: of it, up to which their true times differ from the even ones that they have. aliased:
+    the bumps are faster than the keyframes.
     """
     rng = np.random.default_rng([world, 2])
     late = uneven * np.random.default_rng([world, 4]).uniform(-1, 1, keyframes)
-    path = path_of(yaw_deg, keyframe_s * (np.arange(keyframes) + late), world, shaking_deg_s)
+    path = path_of(yaw_deg, keyframe_s * (np.arange(keyframes) + late), world, shaking_deg_s,
+                   aliased)
     rotations, translations = path.poses()
     centres = -np.einsum('kji,kj->ki', rotations, translations)
     many = 40 * tracks

@@ -287,6 +287,8 @@ READOUT_SIGMA_S = 0.02
 # prior sigmas of how much faster a camera turns than the spline says: about the axis of the turn,
 # and about the others (3 degrees a second)
 STEERING_RAD_S, BUMPS_RAD_S = 0.005, 0.05
+# degrees: bumps turn a camera by less
+STEERED_DEG = 15.0
 
 
 @dataclass(frozen=True)
@@ -612,6 +614,16 @@ class Imaging:
         found = self.blocks.get(name)
         return found.value if isinstance(found, ImageBlock) else {}
 
+    def steering(self, stretch: Stretch) -> Floats:
+        """Return the (3, 3) projection of how the camera turns on what the poses can say of it.
+
+        About the axis of turns alone where Shake is free: a camera that bumps shake turns about
+        the others several times between two keyframes, and their difference is another speed.
+        """
+        shake = self.blocks.get(Shake.name)
+        axis = shake.axes.get(stretch.turn) if isinstance(shake, Shake) else None
+        return np.eye(3) if axis is None else np.outer(axis, axis)
+
     @property
     def coupled(self) -> bool:
         """Return whether it counts how poses, and shakes, change the motion of the camera."""
@@ -698,6 +710,7 @@ class Imaging:
         shakes = self.of_images(Shake.name).get(stretch.turn)
         if Readout.name not in self.blocks:
             return Seen(stretch, observed, self, rotated, still, still, still * 0, still * 0, late)
+        turning = turning @ self.steering(stretch)
         by_readout = late[:, None] * (_cross(turning[rows], still) + moving[rows])
         turned, local = self.readout_s * turning[rows], still + self.readout_s * by_readout
         if shakes is not None:
@@ -747,7 +760,21 @@ def imaging_with(camera: Camera, stretches: Sequence[Stretch] = ()) -> Imaging:
     basis = field_basis(camera)
     return Imaging.of(
         Lens(camera), Readout(), Smooth(np.zeros(basis.shape[1]), basis),
-        Shake(axes={stretch.turn: main_axis(stretch.turned) for stretch in stretches}))
+        Shake(axes=_axes_of(stretches)))
+
+
+def _axes_of(stretches: Sequence[Stretch]) -> dict[TurnId, Floats]:
+    """Return the axis about which each stretch is steered, (3,), in the camera's axes.
+
+    A gentle one has that of the sharpest turn; without any, the vertical of upright pictures.
+    """
+    axes = {stretch.turn: main_axis(stretch.turned) for stretch in stretches}
+    turned = {stretch.turn: float(np.degrees(np.ptp(stretch.turned @ axes[stretch.turn])))
+              for stretch in stretches}
+    sharpest = max(turned, key=lambda turn: turned[turn], default=None)
+    upright = np.array([0.0, 1.0, 0.0])
+    steered = axes[sharpest] if sharpest and turned[sharpest] > STEERED_DEG else upright
+    return {turn: axis if turned[turn] > STEERED_DEG else steered for turn, axis in axes.items()}
 
 
 def lens_alone(camera: Camera) -> Imaging:

@@ -137,8 +137,9 @@ def linearised(seen: Seen, loss_px: float, safe: bool = False) -> Linear:
     follow = None
     if coupled:
         used = observed.keyframes
-        follow = imaging.readout_s * stretch.trajectory.follow()[used][:, :, used].reshape(
-            POSE * len(used), POSE * len(used))
+        each = stretch.trajectory.follow()[used][:, :, used]
+        each[:, :3] = np.einsum('ab,kbjc->kajc', imaging.steering(stretch), each[:, :3])
+        follow = imaging.readout_s * each.reshape(POSE * len(used), POSE * len(used))
     return Linear(seen, wide, own, by_image, u[:-1] @ u.T + v[:-1] @ v.T, points, mixed, follow)
 
 
