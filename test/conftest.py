@@ -2,6 +2,8 @@
 """What holds for all tests; fixtures of those that talk to the node, which import rclpy late."""
 import os
 import signal
+import sys
+from pathlib import Path
 
 import pytest
 
@@ -9,6 +11,14 @@ import pytest
 # several tests run at a time they mostly wait for each other
 for name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
     os.environ.setdefault(name, '1')
+
+# the tests start some hundred processes. Where Python may write no compiled files beside the
+# sources, each would compile all that it imports, for seconds: they share a folder
+if sys.dont_write_bytecode:
+    sys.dont_write_bytecode = False
+    sys.pycache_prefix = str(Path(__file__).parents[1] / '.pytest_cache' / 'compiled')
+    os.environ['PYTHONPYCACHEPREFIX'] = sys.pycache_prefix
+    os.environ.pop('PYTHONDONTWRITEBYTECODE', None)
 
 pytest.register_assert_rewrite('ros_bench', 'ros_desk')
 

@@ -66,17 +66,21 @@ def ros_environment(home):
         'PYTHONPATH': os.pathsep.join([str(REPOSITORY), os.environ.get('PYTHONPATH', '')])}
 
 
+def pairs(parameters):
+    """Return parameters as ROS's arguments; a__b is for a.b."""
+    return [part for name, value in parameters.items()
+            for part in ('-p', f'{name.replace("__", ".")}:={_yaml(value)}')]
+
+
 class NodeProcess:
     """The node, started as a user would; its output goes to a file."""
 
     def __init__(self, home, *arguments, command=COMMAND, python_path=None, **parameters):
         self.home = Path(home)
         self.output = self.home / f'node-{time.monotonic_ns()}.log'
-        pairs = [part for name, value in parameters.items()
-                 for part in ('-p', f'{name.replace("__", ".")}:={_yaml(value)}')]
         with self.output.open('wb') as stream:
             self.process = subprocess.Popen(
-                [*command, '--ros-args', *pairs, *arguments], stdout=stream,
+                [*command, '--ros-args', *pairs(parameters), *arguments], stdout=stream,
                 stderr=subprocess.STDOUT,
                 env={**os.environ, **ros_environment(home),
                      **({'PYTHONPATH': python_path} if python_path else {})},

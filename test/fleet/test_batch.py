@@ -11,11 +11,11 @@ import sys
 
 import numpy as np
 import pytest
-from fleet_made import CONFIG, YAWS, Here, clip_of, lens_of, written
+from fleet_made import CONFIG, YAWS, Here, clip_of, lens_of, remembered, written
 from made_drives import drive, images, smooth, write_bag, write_video
 
 from dashcalib_ros.errors import ConfigError, OutputError
-from dashcalib_ros.fleet import storage
+from dashcalib_ros.fleet import fuse, storage
 from dashcalib_ros.fleet.batch import batch, cameras_of, problems, shard_of
 from dashcalib_ros.fleet.clips import GONE
 from dashcalib_ros.fleet.engine import LocalEngine
@@ -28,6 +28,14 @@ FEW = {'tracks': 60, 'keyframes': 7}
 FILES = ('cameras.parquet', 'cameras.csv', 'clips.parquet', 'clips.csv', 'overview.html')
 # units of one model of lens: by chance a sound lens is written with more coefficients
 SETTINGS = CONFIG.replace({'fleet.least_units': 3, 'model': 'radial'})
+
+
+@pytest.fixture(scope='module', autouse=True)
+def solved_once():
+    """Solve the same turns once: what is tested is which are solved, and what is kept of it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fuse, 'solve', remembered(fuse.solve))
+        yield
 
 
 class Flaky(Here):

@@ -2,6 +2,7 @@
 """The node between real processes: stopped in every state, fed bad input, asked for services."""
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -32,6 +33,7 @@ from ros_bench import (
     image_message,
     keep_file,
     noise,
+    pairs,
     ros_environment,
     stream,
 )
@@ -57,8 +59,8 @@ for n in range(int(sys.argv[1]), 10**9):
 # -- the end ----------------------------------------------------------------------------------
 
 @pytest.mark.parametrize('signals', [
-    (signal.SIGINT,), (signal.SIGTERM,), (signal.SIGHUP,), (signal.SIGINT, signal.SIGINT),
-    (signal.SIGTERM, signal.SIGINT)], ids=['SIGINT', 'SIGTERM', 'SIGHUP', 'two SIGINT', 'both'])
+    (signal.SIGINT,), (signal.SIGTERM,), (signal.SIGHUP,), (signal.SIGTERM, signal.SIGINT)],
+    ids=['SIGINT', 'SIGTERM', 'SIGHUP', 'both'])
 def test_it_ends_cleanly_while_it_collects(start_node, make_bench, signals):
     node, camera = start_node(command=COMMAND), make_bench()
     camera.connect(node)
@@ -76,8 +78,9 @@ def test_nohup_lets_it_outlive_its_terminal(start_node, make_bench):
     assert node.stop(signal.SIGTERM) == 0
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-@pytest.mark.parametrize('delay', [0.0, 0.2, 0.4])
+# one handler has all three
+@pytest.mark.parametrize(('delay', 'number'), [
+    (0.0, signal.SIGINT), (0.2, signal.SIGTERM), (0.4, signal.SIGHUP)])
 def test_it_ends_cleanly_while_it_starts(start_node, number, delay):
     """From the node's own first line on: before that it is Python that starts."""
     node = start_node(command=COMMAND)
@@ -450,7 +453,7 @@ def test_services_say_why_not(plain):
 
 
 # codes are of this room; those of the core are tested there
-@pytest.mark.parametrize(('parameters', 'words', 'code'), [
+BAD = (
     ({'turns__half_width': 99.0}, 'between 0.5 and 10', ''),
     ({'turns__wanted': 2.5}, 'must be of type int', ''),
     ({'model': 'mirror'}, 'auto, radial, brown, fisheye', ''),
@@ -476,12 +479,37 @@ def test_services_say_why_not(plain):
     ({'turns__half_widht': 3}, 'turns.half_width', 'E-PARAMETER-UNKNOWN'),
     ({'check_only': True}, 'start checker', 'E-CHECK-ONLY-REMOVED'),
     ({'of_another_node': 3}, 'of_another_node', 'E-PARAMETER-UNKNOWN'),
-])
-def test_a_bad_parameter_ends_it_with_one_line(start_node, parameters, words, code):
-    node = start_node(**parameters)
-    assert node.process.wait(SOON) == 2
-    assert words in node.text and len(node.text.splitlines()) == 1, node.text
-    assert code in node.text
+)
+# the program as often as there are arguments, one after the other; behind what each wrote to
+# stderr its exit code
+ONE_BY_ONE = """
+import json, os, sys
+from dashcalib_ros.ros import main
+for arguments in json.loads(sys.argv[1]):
+    os.write(2, f'\\0{main("calibrator", ["--ros-args", *arguments])}\\0'.encode())
+"""
+
+
+@pytest.fixture(scope='module')
+def refusals(tmp_path_factory):
+    """Return what one process says to each of the bad parameters, and its exit code."""
+    home = tmp_path_factory.mktemp('refusals')
+    done = subprocess.run(
+        [sys.executable, '-c', ONE_BY_ONE, json.dumps([pairs(given) for given, *_ in BAD])],
+        capture_output=True, text=True, env={**os.environ, **ros_environment(home)},
+        timeout=SOON + len(BAD))
+    texts = done.stderr.split('\0')
+    assert len(texts) == 2 * len(BAD) + 1, done.stderr
+    return list(zip(texts[::2], texts[1::2], strict=False))
+
+
+@pytest.mark.parametrize('number', range(len(BAD)))
+def test_a_bad_parameter_ends_it_with_one_line(refusals, number):
+    _, words, code = BAD[number]
+    text, status = refusals[number]
+    assert status == '2'
+    assert words in text and len(text.splitlines()) == 1, text
+    assert code in text
 
 
 def test_a_mask_of_another_size_ends_it_at_the_first_image(start_node, make_bench, tmp_path):

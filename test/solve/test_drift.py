@@ -12,6 +12,8 @@ from synthetic import LENS, SIZE
 from dashcalib_ros.judge.verdict import judge
 from dashcalib_ros.reconstruct.scene import Scene
 
+pytestmark = pytest.mark.usefixtures('no_profile')
+
 MIDDLE = (np.array(SIZE) - 1) / 2
 
 
