@@ -520,6 +520,19 @@ def _on_bound(grounds: Grounds) -> Finding | None:
                    'lenses wider than 190° cannot be calibrated')
 
 
+# sigmas of the rays over the picture; real and rendered drives have up to 0.35
+MAX_LAST_STEP = 0.5
+
+
+def _not_converged(grounds: Grounds) -> Finding | None:
+    last = grounds.solution.unsettled
+    if last <= MAX_LAST_STEP:
+        return None
+    return Finding('E-NOT-CONVERGED', 'weak',
+                   f'the search for the camera did not come to rest: its last step moved the '
+                   f'picture by {last:.1f} sigma', MORE_TURNS)
+
+
 def _folds_over(grounds: Grounds) -> Finding | None:
     camera = grounds.solution.camera
     if camera.covers_picture():
@@ -633,6 +646,6 @@ ENOUGH: tuple[Rule, ...] = (
 # whether anything contradicts the result
 SOUND: tuple[Rule, ...] = (
     turns_disagree, other_camera, _not_fixed, _drifts, _uneven_times, _strange_aspect,
-    _strange_shutter, _on_bound, _folds_over, _other_model, _other_kind, _moves_sideways,
-    _turned_pictures, _lines_disagree, _sensors_disagree, _two_cameras)
+    _strange_shutter, _on_bound, _not_converged, _folds_over, _other_model, _other_kind,
+    _moves_sideways, _turned_pictures, _lines_disagree, _sensors_disagree, _two_cameras)
 RULES = (*ENOUGH, *SOUND)

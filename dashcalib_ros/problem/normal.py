@@ -77,6 +77,11 @@ class Linear:
                 at += block.count
         return found
 
+    @cached_property
+    def without_points(self) -> tuple[Floats, Floats]:
+        """Return what is left without the points, none damped, and the inverse of their blocks."""
+        return _without_points(self, np.inf)
+
 
 def linearised(seen: Seen, loss_px: float, safe: bool = False) -> Linear:
     """Return the used observations, linearised, under the Cauchy loss of this scale.
@@ -227,11 +232,8 @@ def normal_equations(linear: Linear, variance: float = 1.0, kept: Sequence[str] 
     is trusted; inf: it is not damped.
     """
     own, extras = linear.own, linear.extras
-    whole, inverse = _without_points(linear, radius)
-    if linear.follow is not None:
-        poses, motion = extras['pose'], extras['motion']
-        whole[:, poses] += whole[:, motion] @ linear.follow
-        whole[poses] += linear.follow.T @ whole[motion]
+    whole, inverse = (linear.without_points if radius == np.inf
+                      else _without_points(linear, radius))
     gone = tuple(name for name in extras if name != 'motion' and name not in kept)
     first = np.concatenate([extras[name] for name in gone])
     rest = np.concatenate([*(extras[name] for name in kept if name in extras),
@@ -297,6 +299,10 @@ def _without_points(linear: Linear, radius: float) -> tuple[Floats, Floats]:
         whole[low:high, inner:] -= squares[:width, width:]
         whole[inner:, inner:] -= squares[width:, width:]
     whole[inner:, :inner] = whole[:inner, inner:].T
+    if linear.follow is not None:
+        poses, motion = linear.extras['pose'], linear.extras['motion']
+        whole[:, poses] += whole[:, motion] @ linear.follow
+        whole[poses] += linear.follow.T @ whole[motion]
     return whole, inverse
 
 
