@@ -30,8 +30,14 @@ from dashcalib_ros.judge.agreement import (
 from dashcalib_ros.judge.calibration import Condition, Level, Verdict, Witnesses
 from dashcalib_ros.judge.mount import roll_of_path
 from dashcalib_ros.reconstruct.heading import off_axis_deg, roll_deg
-from dashcalib_ros.solve.evidence import HIDDEN_DEG, LEAST_GAIN, FixedCameraTest, largest_crop
-from dashcalib_ros.solve.solution import CLEAR_KIND_RATIO, Solution
+from dashcalib_ros.solve.evidence import (
+    HIDDEN_DEG,
+    LEAST_GAIN,
+    LEAST_KIND_GAIN,
+    FixedCameraTest,
+    largest_crop,
+)
+from dashcalib_ros.solve.solution import Solution
 
 # cures that several rules have, or that others look for
 STEADY = 'switch off the stabiliser and fix the zoom, then record another drive'
@@ -584,7 +590,7 @@ def _other_kind(grounds: Grounds) -> Finding | None:
             continue
         alike_px = MAX_KIND_SIGMAS * solution.picture.rms
         far = each.apart_px is None or each.apart_px > alike_px
-        if far and each.cost_ratio < CLEAR_KIND_RATIO:
+        if far and each.cost_ratio < 1 + LEAST_KIND_GAIN:
             return Finding('E-LENS-AMBIGUOUS', 'weak',
                            f'the turns do not show whether the lens is {camera.model} or '
                            f'{each.model}, and these differ near the corners', CORNERS)

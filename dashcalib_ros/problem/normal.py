@@ -126,25 +126,28 @@ def linearised(seen: Seen, loss_px: float, safe: bool = False) -> Linear:
         by_image[k] = u[:own] @ u.T + v[:own] @ v.T
     u, v = wide[:, POINT + own:]
     points, mixed = np.empty((len(observed.tracks), 3, 3)), []
+    # each observation in one piece, and one of zeros, with which short tracks are filled up
+    rows = np.zeros((count + 1, 2, size))
+    rows[:-1] = wide.transpose(2, 0, 1)
     for chunk in observed.chunks:
-        a, b = wide[:, :, chunk.observations]
-        across = a[:POINT, None] * a + b[:POINT, None] * b
-        ends = np.add.reduceat(
-            np.concatenate([across[:, :POINT], across[:, POINT + own:]], axis=1),
-            chunk.starts, axis=2)
+        each = rows[chunk.table].reshape(len(chunk.points), -1, size)
+        sums = each[:, :, :POINT].transpose(0, 2, 1) @ each
+        a, b = wide[:, :POINT + own, chunk.observations]
         span = chunk.end - chunk.begin
         part = np.zeros((POINT, own * span + size - POINT - own, len(chunk.points)))
         part[:, :own * span].reshape(POINT, span, own, -1).transpose(0, 2, 1, 3)[
-            :, :, chunk.image, chunk.place] = across[:, POINT:POINT + own]
-        part[:, own * span:] = ends[:, POINT:]
-        points[chunk.points] = ends[:, :POINT].transpose(2, 0, 1)
+            :, :, chunk.image, chunk.place] = a[:POINT, None] * a[POINT:] + b[:POINT, None] * b[
+                POINT:]
+        part[:, own * span:] = sums[:, :, POINT + own:].transpose(1, 2, 0)
+        points[chunk.points] = sums[:, :, :POINT]
         mixed.append(part)
     follow = None
     if coupled:
         used = observed.keyframes
         follow = imaging.readout_s * stretch.trajectory.follow()[used][:, :, used].reshape(
             POSE * len(used), POSE * len(used))
-    return Linear(seen, wide, own, by_image, u[:-1] @ u.T + v[:-1] @ v.T, points, mixed, follow)
+    # of a matrix and its own transpose only one half is computed
+    return Linear(seen, wide, own, by_image, (u @ u.T + v @ v.T)[:-1], points, mixed, follow)
 
 
 def _crossed(a: Floats, b: Floats) -> Floats:

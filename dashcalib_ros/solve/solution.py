@@ -21,9 +21,6 @@ from dashcalib_ros.solve.written import Written, written
 
 # fewer turns are not left out: one of two says little of the other
 LEAST_TURNS = 3
-# cost_ratio of the kinds of lenses: behind true fisheyes pinholes have 1.15 to 2, each with a
-# field of its own; behind windscreens fisheyes have 1.01 to 1.06
-CLEAR_KIND_RATIO = 1.08
 
 
 @dataclass(frozen=True)
