@@ -321,7 +321,8 @@ def _write_case(seed: int, config: Config, path: Path) -> str:
     return f'{len(case.scenes)} scenes of {len(case.spec.turn_list)} turns, {case.cpu_s:.0f} CPU s'
 
 
-def _seeds(text: str) -> range:
+def seeds_of(text: str) -> range:
+    """Return the seeds that an argument names."""
     first, _, last = text.partition('-')
     return range(int(first), int(last or first) + 1)
 
@@ -332,7 +333,7 @@ def main() -> None:
     # COLMAP and Ceres warn of is not shown by a calibrator's children either
     os.environ.update({**dict.fromkeys(THREAD_VARIABLES, '1'), 'GLOG_minloglevel': '2'})
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n')[0])
-    parser.add_argument('--seeds', type=_seeds, required=True, help='a seed, or the first-last')
+    parser.add_argument('--seeds', type=seeds_of, required=True, help='a seed, or the first-last')
     parser.add_argument('--out', type=Path, required=True)
     parser.add_argument('--workers', type=int, default=1, help='drives at a time')
     parser.add_argument('--stage', choices=('scenes', 'all'), default='all')

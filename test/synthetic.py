@@ -100,7 +100,8 @@ class Path:
         return local + np.cross(self.shaking[:, None] * late_s[..., None], local)
 
     def _bumps(self, seconds: np.ndarray) -> np.ndarray:
-        if self.aliased or np.array_equal(seconds, np.broadcast_to(self.seconds[:, None], seconds.shape)):
+        keyframes = np.broadcast_to(self.seconds[:, None], seconds.shape)
+        if self.aliased or np.array_equal(seconds, keyframes):
             return np.broadcast_to(self.bumps[:, None], (*seconds.shape, 3))
         # it takes half a second to load, and test_rooms.py says where it is not needed
         from scipy.interpolate import CubicSpline

@@ -20,7 +20,8 @@ from dashcalib_ros.camera.camera import PINHOLE, TINY, Camera, ColmapModel
 
 # tangent of 85 degrees: no pinhole camera sees farther out
 WIDEST = 11.4
-NEWTON_STEPS = 12
+# of the search for a ray, and the last one's length: the error that it leaves is its square
+NEWTON_STEPS, SETTLED = 12, 1e-9
 # of the focal length; a pixel without a solution this exact has no ray
 REACHED = 1e-6
 # points nearer to the plane of the pinhole than this cannot be projected
@@ -157,10 +158,14 @@ class Brown(Radial):
         wanted = (pixels - [self.cx, self.cy]) / [self.fx, self.fy]
         plain = type(self)(self.image_size, 1.0, 1.0, 0.0, 0.0, *self.params[4:])
         xy = np.clip(np.nan_to_num(wanted.reshape(-1, 2)), -self.fold, self.fold)
+        moving = np.arange(len(xy))
         for _ in range(NEWTON_STEPS):
-            _, slopes, bent = plain.derivatives(np.column_stack([xy, np.ones(len(xy))]))
-            step = _solved(slopes[:, :, :2], wanted.reshape(-1, 2) - bent)
-            xy = xy + np.clip(np.nan_to_num(step), -0.5, 0.5)
+            _, slopes, bent = plain.derivatives(
+                np.column_stack([xy[moving], np.ones(len(moving))]))
+            step = _solved(slopes[:, :, :2], wanted.reshape(-1, 2)[moving] - bent)
+            step = np.clip(np.nan_to_num(step), -0.5, 0.5)
+            xy[moving] += step
+            moving = moving[np.abs(step).max(axis=1, initial=0.0) > SETTLED]
         reached = np.linalg.norm(xy, axis=1) <= 1.02 * self.fold
         missed = np.abs(plain.project(np.column_stack([xy, np.ones(len(xy))]))
                         - wanted.reshape(-1, 2)).max(axis=1)

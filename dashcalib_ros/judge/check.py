@@ -151,10 +151,10 @@ def loss_of(given: Camera, solution: Solution, config: Config) -> float:
 
     given: of the solution's pictures. Poses and points are adjusted anew with each camera held.
     """
-    from dashcalib_ros.solve.optimise import loss_px_of
-    from dashcalib_ros.solve.start import costs_with, with_few_tracks
+    from dashcalib_ros.solve.optimise import FIRST_TRACKS, loss_px_of, subsample_tracks
+    from dashcalib_ros.solve.start import costs_with
     # a part of the tracks says it, and takes a fifth of the time
-    scenes = list(map(with_few_tracks, solution.scenes))
+    scenes = [subsample_tracks(scene, FIRST_TRACKS) for scene in solution.scenes]
     loss_px = loss_px_of(scenes, solution.camera, config.intrinsics)
     own, other = (float(np.mean(costs_with(camera, scenes, loss_px, config.scene.error_px)))
                   for camera in (solution.camera, given))

@@ -23,6 +23,7 @@ from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.judge.agreement import MAX_MISFIT
 from dashcalib_ros.judge.difference import CONTRADICTION, LEAST_SIGMA, RELEVANT, Way, limit_of
 from dashcalib_ros.problem.blocks import lens_alone
+from dashcalib_ros.problem.normal import normal_equations
 from dashcalib_ros.problem.quadratic import Quadratic
 from dashcalib_ros.problem.steps import State
 from dashcalib_ros.reconstruct.heading import Heading, heading
@@ -73,8 +74,7 @@ def reading_of(scene: Scene, camera: Camera, config: Config) -> Reading:
     loss_px = loss_px_of([found], camera, config.intrinsics)
     alone = State(lens_alone(camera), (found,))
     variance = alone.noise(loss_px).variance
-    [normal] = alone.normals(loss_px, variance, safe=False, tracks=True)
-    cost = normal.cost.at_noise(variance)
+    cost = normal_equations(alone.linear(loss_px)[0], tracks=True).cost.at_noise(variance)
     # errors that the observations of a track share make it worth less than their number
     inflation = max(1.0, float(np.trace(np.linalg.pinv(cost.hessian) @ cost.by_track)) / count)
     return Reading(scene.turn, cost.at_noise(inflation), heading(found), misfit=misfit)

@@ -30,8 +30,14 @@ from dashcalib_ros.judge.agreement import (
 from dashcalib_ros.judge.calibration import Condition, Level, Verdict, Witnesses
 from dashcalib_ros.judge.mount import roll_of_path
 from dashcalib_ros.reconstruct.heading import off_axis_deg, roll_deg
-from dashcalib_ros.solve.evidence import HIDDEN_DEG, LEAST_GAIN, FixedCameraTest, largest_crop
-from dashcalib_ros.solve.solution import CLEAR_KIND_RATIO, Solution
+from dashcalib_ros.solve.evidence import (
+    HIDDEN_DEG,
+    LEAST_GAIN,
+    LEAST_KIND_GAIN,
+    FixedCameraTest,
+    largest_crop,
+)
+from dashcalib_ros.solve.solution import Solution
 
 # cures that several rules have, or that others look for
 STEADY = 'switch off the stabiliser and fix the zoom, then record another drive'
@@ -518,6 +524,19 @@ def _on_bound(grounds: Grounds) -> Finding | None:
                    'lenses wider than 190° cannot be calibrated')
 
 
+# sigmas of the rays over the picture; real and rendered drives have up to 0.35
+MAX_LAST_STEP = 0.5
+
+
+def _not_converged(grounds: Grounds) -> Finding | None:
+    last = grounds.solution.unsettled
+    if last <= MAX_LAST_STEP:
+        return None
+    return Finding('E-NOT-CONVERGED', 'weak',
+                   f'the search for the camera did not come to rest: its last step moved the '
+                   f'picture by {last:.1f} sigma', MORE_TURNS)
+
+
 def _folds_over(grounds: Grounds) -> Finding | None:
     camera = grounds.solution.camera
     if camera.covers_picture():
@@ -569,7 +588,7 @@ def _other_kind(grounds: Grounds) -> Finding | None:
             continue
         alike_px = MAX_KIND_SIGMAS * solution.picture.rms
         far = each.apart_px is None or each.apart_px > alike_px
-        if far and each.cost_ratio < CLEAR_KIND_RATIO:
+        if far and each.cost_ratio < 1 + LEAST_KIND_GAIN:
             return Finding('E-LENS-AMBIGUOUS', 'weak',
                            f'the turns do not show whether the lens is {camera.model} or '
                            f'{each.model}, and these differ near the corners', CORNERS)
@@ -631,6 +650,6 @@ ENOUGH: tuple[Rule, ...] = (
 # whether anything contradicts the result
 SOUND: tuple[Rule, ...] = (
     turns_disagree, other_camera, _not_fixed, _drifts, _uneven_times, _strange_aspect,
-    _strange_shutter, _on_bound, _folds_over, _other_model, _other_kind, _moves_sideways,
-    _turned_pictures, _lines_disagree, _sensors_disagree, _two_cameras)
+    _strange_shutter, _on_bound, _not_converged, _folds_over, _other_model, _other_kind,
+    _moves_sideways, _turned_pictures, _lines_disagree, _sensors_disagree, _two_cameras)
 RULES = (*ENOUGH, *SOUND)

@@ -41,6 +41,7 @@ from dashcalib_ros.judge.gyro_scale import (
     straight_between,
 )
 from dashcalib_ros.problem.blocks import lens_alone
+from dashcalib_ros.problem.normal import normal_equations
 from dashcalib_ros.problem.observations import main_axis
 from dashcalib_ros.problem.steps import State
 from dashcalib_ros.reconstruct.scene import Scene
@@ -365,7 +366,8 @@ class Fit:
 def steps_of(scene: Scene, solution: Solution, loss_px: float, start_s: float) -> Steps:
     """Return how a scene's camera turned. start_s: stamp of the drive's first image."""
     structure, rows = scene.structure, scene.observed.keyframes
-    [normal] = State(lens_alone(solution.camera), (scene,)).normals(loss_px, 1.0, safe=False)
+    normal = normal_equations(
+        State(lens_alone(solution.camera), (scene,)).linear(loss_px)[0])
     follow = []
     for step in np.diag(np.sqrt(np.diag(solution.covariance))):
         sigma = float(step.max())

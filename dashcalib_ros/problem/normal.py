@@ -77,6 +77,11 @@ class Linear:
                 at += block.count
         return found
 
+    @cached_property
+    def without_points(self) -> tuple[Floats, Floats]:
+        """Return what is left without the points, none damped, and the inverse of their blocks."""
+        return _without_points(self, np.inf)
+
 
 def linearised(seen: Seen, loss_px: float, safe: bool = False) -> Linear:
     """Return the used observations, linearised, under the Cauchy loss of this scale.
@@ -121,18 +126,20 @@ def linearised(seen: Seen, loss_px: float, safe: bool = False) -> Linear:
         by_image[k] = u[:own] @ u.T + v[:own] @ v.T
     u, v = wide[:, POINT + own:]
     points, mixed = np.empty((len(observed.tracks), 3, 3)), []
+    # each observation in one piece, and one of zeros, with which short tracks are filled up
+    rows = np.zeros((count + 1, 2, size))
+    rows[:-1] = wide.transpose(2, 0, 1)
     for chunk in observed.chunks:
-        a, b = wide[:, :, chunk.observations]
-        across = a[:POINT, None] * a + b[:POINT, None] * b
-        ends = np.add.reduceat(
-            np.concatenate([across[:, :POINT], across[:, POINT + own:]], axis=1),
-            chunk.starts, axis=2)
+        each = rows[chunk.table].reshape(len(chunk.points), -1, size)
+        sums = each[:, :, :POINT].transpose(0, 2, 1) @ each
+        a, b = wide[:, :POINT + own, chunk.observations]
         span = chunk.end - chunk.begin
         part = np.zeros((POINT, own * span + size - POINT - own, len(chunk.points)))
         part[:, :own * span].reshape(POINT, span, own, -1).transpose(0, 2, 1, 3)[
-            :, :, chunk.image, chunk.place] = across[:, POINT:POINT + own]
-        part[:, own * span:] = ends[:, POINT:]
-        points[chunk.points] = ends[:, :POINT].transpose(2, 0, 1)
+            :, :, chunk.image, chunk.place] = a[:POINT, None] * a[POINT:] + b[:POINT, None] * b[
+                POINT:]
+        part[:, own * span:] = sums[:, :, POINT + own:].transpose(1, 2, 0)
+        points[chunk.points] = sums[:, :, :POINT]
         mixed.append(part)
     follow = None
     if coupled:
@@ -140,7 +147,8 @@ def linearised(seen: Seen, loss_px: float, safe: bool = False) -> Linear:
         each = stretch.trajectory.follow()[used][:, :, used]
         each[:, :3] = np.einsum('ab,kbjc->kajc', imaging.steering(stretch), each[:, :3])
         follow = imaging.readout_s * each.reshape(POSE * len(used), POSE * len(used))
-    return Linear(seen, wide, own, by_image, u[:-1] @ u.T + v[:-1] @ v.T, points, mixed, follow)
+    # of a matrix and its own transpose only one half is computed
+    return Linear(seen, wide, own, by_image, (u @ u.T + v @ v.T)[:-1], points, mixed, follow)
 
 
 def _crossed(a: Floats, b: Floats) -> Floats:
@@ -228,11 +236,8 @@ def normal_equations(linear: Linear, variance: float = 1.0, kept: Sequence[str] 
     is trusted; inf: it is not damped.
     """
     own, extras = linear.own, linear.extras
-    whole, inverse = _without_points(linear, radius)
-    if linear.follow is not None:
-        poses, motion = extras['pose'], extras['motion']
-        whole[:, poses] += whole[:, motion] @ linear.follow
-        whole[poses] += linear.follow.T @ whole[motion]
+    whole, inverse = (linear.without_points if radius == np.inf
+                      else _without_points(linear, radius))
     gone = tuple(name for name in extras if name != 'motion' and name not in kept)
     first = np.concatenate([extras[name] for name in gone])
     rest = np.concatenate([*(extras[name] for name in kept if name in extras),
@@ -298,6 +303,10 @@ def _without_points(linear: Linear, radius: float) -> tuple[Floats, Floats]:
         whole[low:high, inner:] -= squares[:width, width:]
         whole[inner:, inner:] -= squares[width:, width:]
     whole[inner:, :inner] = whole[:inner, inner:].T
+    if linear.follow is not None:
+        poses, motion = linear.extras['pose'], linear.extras['motion']
+        whole[:, poses] += whole[:, motion] @ linear.follow
+        whole[poses] += linear.follow.T @ whole[motion]
     return whole, inverse
 
 

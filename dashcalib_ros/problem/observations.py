@@ -56,6 +56,12 @@ class Structure:
     registered: Mask
     used: Mask
 
+    @property
+    def local(self) -> Floats:
+        """Return (k, t, 3) the points in the axes of each camera."""
+        return np.asarray(
+            self.points @ self.rotations.transpose(0, 2, 1) + self.translations[:, None])
+
     def path(self) -> tuple[Floats, Floats]:
         """Return the rotations (n, 3, 3) and the centres (n, 3) of the n registered images."""
         rotations = self.rotations[self.registered]
@@ -67,7 +73,8 @@ class Chunk:
     """Points (c,), their observations (m,) point by point, and where each point's begin (c,).
 
     place: (m,) of the point; image: (m,) counted from the first one that sees any, begin; end:
-    behind the last one.
+    behind the last one. table: (c, l) the observations of each point, filled up with one more
+    than there are.
     """
 
     points: Ints
@@ -77,6 +84,7 @@ class Chunk:
     begin: int
     end: int
     starts: Ints
+    table: Ints
 
 
 @dataclass(frozen=True)
@@ -124,7 +132,7 @@ class Observed:
         """Return the points in groups that are seen by few images."""
         first = np.full(len(self.tracks), len(self.keyframes))
         np.minimum.at(first, self.point, self.image)
-        order = np.argsort(first, kind='stable')
+        order = np.lexsort([np.bincount(self.point), first])
         rank = np.empty_like(order)
         rank[order] = np.arange(len(order))
         by_point = np.lexsort([self.image, rank[self.point]])
@@ -137,8 +145,12 @@ class Observed:
             images = self.image[theirs]
             begin = int(images.min())
             place = sorted_rank[low:high] - start
+            starts = np.flatnonzero(np.diff(place, prepend=-1))
+            nth = np.arange(len(theirs)) - starts[place]
+            table = np.full((len(some), int(nth.max()) + 1), len(self.rows))
+            table[place, nth] = theirs
             found.append(Chunk(some, theirs, place, images - begin, begin, int(images.max()) + 1,
-                               np.flatnonzero(np.diff(place, prepend=-1))))
+                               starts, table))
         return found
 
 

@@ -7,7 +7,7 @@ it lowers the cost, it is damped (Levenberg-Marquardt). The tracks stay as they 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Generic, TypeVar
 
@@ -20,7 +20,6 @@ from dashcalib_ros.problem.normal import (
     Follow,
     Linear,
     Noise,
-    Normal,
     damping,
     linearised,
     moved_by,
@@ -28,7 +27,7 @@ from dashcalib_ros.problem.normal import (
     normal_equations,
 )
 from dashcalib_ros.problem.observations import Stretch
-from dashcalib_ros.problem.quadratic import Quadratic
+from dashcalib_ros.problem.quadratic import NONE, Quadratic
 
 # shares of a step that are tried, the longest first: safe steps are a little short
 PARTS = (1.3, 0.7, 0.3, 0.1, 0.02)
@@ -42,8 +41,8 @@ SETTLING = 3
 # steps in a row that lower nothing
 FAILURES = 5
 # of the cost, in units of the noise: by how much a step of what is shared lowers it at the most
-# where it is the last one, 0.2 of a sigma; and where the optimum is reached all the same
-SETTLED, REACHED = 0.04, 0.2
+# where it is the last one, 0.2 of a sigma
+SETTLED = 0.04
 # eigenvalues below this share of the largest, each parameter in its own unit: of a direction that
 # nothing determines
 SINGULAR = 1e-15
@@ -59,18 +58,21 @@ class Undetermined(np.linalg.LinAlgError):
         self.names = names
 
 
+S = TypeVar('S', bound='State')
+
+
 @dataclass(frozen=True)
 class State:
     """The present state of a problem.
 
     stretches: each with its tracks as measured. inflation: of the noise, by errors that the
-    observations of a track share. converged: whether the last steps reached the optimum.
+    observations of a track share. last: (m,) the last step of what is shared; empty for none.
     """
 
     imaging: Imaging
     stretches: tuple[Stretch, ...]
     inflation: float = 1.0
-    converged: bool = False
+    last: Floats = field(default_factory=lambda: NONE)
 
     @property
     def camera(self) -> Camera:
@@ -92,19 +94,15 @@ class State:
                     for each in self.seen)
         return loss_px**2 * total / unit + self.imaging.prior_cost(self.stretches)
 
-    def normals(self, loss_px: float, unit: float, safe: bool = True, tracks: bool = False,
-                images: bool = False) -> list[Normal]:
-        """Return the normal equations of each stretch.
+    def linear(self, loss_px: float, safe: bool = False) -> list[Linear]:
+        """Return the observations of each stretch, linearised."""
+        return [linearised(each, loss_px, safe) for each in self.seen]
 
-        images: what observations of one image share counts, too, where its picture is not shifted.
-        """
-        return [normal_equations(
-            linearised(each, loss_px, safe), unit, tracks=tracks,
-            images=images and all(block.turns for block in self.imaging.of_each_image(
-                each.stretch))) for each in self.seen]
-
-
-S = TypeVar('S', bound=State)
+    def sized(self: S, imaging: Imaging, inflation: float) -> S:
+        """Return it with other sizes of noise and priors: what is seen stays."""
+        found = replace(self, imaging=imaging, inflation=inflation)
+        found.__dict__['seen'] = self.seen
+        return found
 
 
 @dataclass(frozen=True)
@@ -125,17 +123,17 @@ class Stepping:
 
 
 def optimised(start: S, how: Stepping,
-              chosen: Callable[[S, int], S] = lambda now, n: now) -> S:
+              chosen: Callable[[S, Sequence[Linear], int], S] = lambda now, linear, n: now) -> S:
     """Return the state after steps that lower its cost.
 
-    chosen: the state before step n with the sizes of its priors; these hardly change. Raises
-    Undetermined.
+    chosen: the state before step n, linearised, with the sizes of its priors. Raises Undetermined.
     """
     now, trust = start, _Trust(how.radius)
     for n in range(how.steps):
-        now = chosen(replace(now, imaging=now.imaging.anchored()), n)
+        now = replace(now, imaging=now.imaging.anchored(), last=NONE)
+        linear = now.linear(how.loss_px, safe=True)
+        now = chosen(now, linear, n)
         unit = how.unit or now.noise(how.loss_px).variance * now.inflation
-        linear = [linearised(each, how.loss_px, safe=True) for each in now.seen]
         before = now.cost(how.loss_px, unit)
         for _ in range(FAILURES + 1):
             tried = _tried(now, linear, how.loss_px, unit, before, trust)
@@ -146,8 +144,8 @@ def optimised(start: S, how: Stepping,
             # no step lowers the cost: this is as low as it gets
             return now
         if not tried.lowers:
-            return replace(now, converged=True)
-        now = replace(tried.after, converged=tried.shared_gain < REACHED)
+            return now
+        now = tried.after
         if ((tried.shared_gain < how.settled and trust.whole)
                 or tried.gain <= how.tolerance * before):
             break
@@ -216,10 +214,10 @@ def _tried(now: S, linear: Sequence[Linear], loss_px: float, unit: float, before
 
 def _settled(now: S, loss_px: float, unit: float) -> S:
     """Return the state with poses and points one step nearer to what all else asks of them."""
-    linear = [linearised(each, loss_px, safe=True) for each in now.seen]
+    linear = now.linear(loss_px, safe=True)
     still = np.zeros(len(now.imaging.names))
-    return _Step(still, [normal_equations(each, unit).follow(still) for each in linear], 0.0, 0.0
-                 ).taken(now, 1.0)
+    follows = [normal_equations(each, unit).follow(still) for each in linear]
+    return replace(_Step(still, follows, 0.0, 0.0).taken(now, 1.0), last=now.last)
 
 
 @dataclass(frozen=True)
@@ -256,7 +254,8 @@ class _Step:
                 block = imaging.blocks[name]
                 assert isinstance(block, ImageBlock)
                 imaging = imaging.having(block.moved_in(stretch, part * step))
-        return replace(now, imaging=imaging, stretches=tuple(stretches))
+        return replace(now, imaging=imaging, stretches=tuple(stretches),
+                       last=part * self.shared)
 
 
 def bounded(total: Quadratic, imaging: Imaging) -> Floats:

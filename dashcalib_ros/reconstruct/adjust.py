@@ -13,7 +13,7 @@ from dashcalib_ros.config import SceneConfig
 from dashcalib_ros.problem.blocks import Imaging, Lens
 from dashcalib_ros.problem.observations import Stretch
 from dashcalib_ros.problem.steps import FIRST_RADIUS, State, Stepping, optimised
-from dashcalib_ros.reconstruct.scene import Scene, projected_px, retriangulated
+from dashcalib_ros.reconstruct.scene import Scene, retriangulated
 
 # steps of one adjustment at the most; 60 move fx by 0.03 % at the most, at twice the time
 MAX_ITERATIONS = 12
@@ -97,8 +97,7 @@ def _in_front(scenes: Sequence[Scene]) -> list[Scene]:
     found = []
     for scene in scenes:
         structure = scene.structure
-        local = (structure.points @ structure.rotations.transpose(0, 2, 1)
-                 + structure.translations[:, None])
+        local = structure.local
         ahead = local[:, :, 2] > IN_FRONT * np.linalg.norm(local, axis=2)
         used = structure.used & ahead
         used &= used.sum(axis=0) >= 2
@@ -113,9 +112,9 @@ def _projected(scenes: Sequence[Scene], camera: Camera) -> list[Scene]:
     """
     found = []
     for scene in scenes:
-        ahead = np.isfinite(projected_px(scene, camera)).all(axis=1)
+        used = scene.structure.used.copy()
+        ahead = np.isfinite(camera.project(scene.structure.local[used])).all(axis=1)
         if not ahead.all():
-            used = scene.structure.used.copy()
             used[used] = ahead
             scene = replace(scene, structure=replace(scene.structure, used=used))
         found.append(scene)

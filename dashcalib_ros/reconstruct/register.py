@@ -70,8 +70,7 @@ def register_tracks(tracks: Tracks, structure: Structure, camera: Camera,
 
 def _depths(structure: Structure, camera: Camera) -> Floats:
     """Return (k, t) depths of the points in each image; 0 where not registered or behind."""
-    depth = camera.depths(structure.points @ structure.rotations.transpose(0, 2, 1)
-                          + structure.translations[:, None])
+    depth = camera.depths(structure.local)
     return np.asarray(np.where(structure.registered[:, None], np.maximum(depth, 0.0), 0.0))
 
 

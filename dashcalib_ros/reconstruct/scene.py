@@ -242,18 +242,7 @@ def rms_px(scenes: Sequence[Scene], camera: Camera) -> float:
 
 def residuals_px(scene: Scene, camera: Camera) -> Floats:
     """Return (k, t, 2) projected minus observed, px; NaN where unseen or behind the camera."""
-    structure = scene.structure
-    local = (structure.points @ structure.rotations.transpose(0, 2, 1)
-             + structure.translations[:, None])
-    return np.asarray(camera.project(local) - scene.tracks.xy)
-
-
-def projected_px(scene: Scene, camera: Camera) -> Floats:
-    """Return (n, 2) where the points of the used observations are projected, image by image."""
-    structure = scene.structure
-    image, point = np.nonzero(structure.used)
-    local = np.einsum('nij,nj->ni', structure.rotations[image], structure.points[point])
-    return camera.project(local + structure.translations[image])
+    return np.asarray(camera.project(scene.structure.local) - scene.tracks.xy)
 
 
 def truncated_cost(scene: Scene, camera: Camera, limit_px: float) -> float:

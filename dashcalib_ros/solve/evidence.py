@@ -22,10 +22,17 @@ from dashcalib_ros.camera import MODELS
 from dashcalib_ros.camera.mapping import mapping_error
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.problem.blocks import Bend, Block, Drift, ImageBlock, Shift, Zoom
-from dashcalib_ros.problem.normal import Normal, linearised, normal_equations
+from dashcalib_ros.problem.normal import Normal, normal_equations
 from dashcalib_ros.problem.quadratic import Quadratic
 from dashcalib_ros.reconstruct.scene import errors_px
-from dashcalib_ros.solve.optimise import FIRST_TRACKS, TEST_LOSS, Estimate, likeliest
+from dashcalib_ros.solve.optimise import (
+    FIRST_TRACKS,
+    TEST_LOSS,
+    Estimate,
+    costs_by_track,
+    likeliest,
+)
+from dashcalib_ros.solve.written import sees_as_pinhole
 
 Kind = Literal['shift', 'zoom', 'bend']
 
@@ -47,8 +54,10 @@ HIDDEN_DEG, SHARP_DEG = 20.0, 45.0
 STEADY, DRIFTS, DRIFT_NATS, LEAST_DRIFTING = 1e-6, (0.002, 0.005, 0.015, 0.05), 4.0, 3
 # noise variances of a track by which a kind of lens must predict turns better
 LEAST_GAIN = 30.0
-# the same of another kind, of its cost: fisheyes have 0.13 and more, windscreens up to 0.06
-LEAST_KIND_GAIN = 0.08
+# the same of another kind, of its cost: fisheyes have 0.1 and more, windscreens up to 0.06; and
+# px RMS of 1000 px of width, of which fisheyes have 0.026 and more. Where tracks are nearly exact,
+# what a smooth field leaves of a windscreen, or what a step would still lower, is much of a cost
+LEAST_KIND_GAIN, LEAST_KIND_PX = 0.08, 0.015
 
 
 # the kind of lens
@@ -74,8 +83,7 @@ class Candidate:
 def costs_of(now: Estimate, loss_px: float) -> list[Quadratic]:
     """Return each turn's cost about what turns share, at the noise; images' shifts follow."""
     unit = now.noise(loss_px).variance * now.inflation
-    return [normal.cost.at_noise(unit) for normal in now.normals(
-        loss_px, unit, safe=False, tracks=True, images=True)]
+    return [cost.at_noise(unit) for cost in costs_by_track(now.linear(loss_px), unit)]
 
 
 def costs_left_out(now: Estimate, loss_px: float) -> dict[TurnId, float]:
@@ -123,14 +131,26 @@ def chosen_kind(found: Sequence[Estimate]) -> tuple[Estimate, tuple[Candidate, .
         alike = found[n].camera.family == found[best].camera.family
         # no real lens folds over: where the pinholes need that, a fisheye need not be as good
         mends = found[n].camera.covers_picture() and not found[best].camera.covers_picture()
-        if (((alike or mends) and is_clear(gains))
-                or is_clear(gains, LEAST_KIND_GAIN * sum(totals[n].values()))):
+        if is_clear(gains) and (alike or mends or is_clear(
+                gains, _least_of_another(found[n], sum(totals[n].values()), least))):
             best = n
     sums = [sum(each.values()) for each in totals]
     chosen = found[best]
     return chosen, tuple(Candidate(
         each.camera.model, sums[n] - sums[best], mapping_error(each.camera, chosen.camera),
         n == best, sums[n] / sums[best]) for n, each in enumerate(found))
+
+
+def _least_of_another(found: Estimate, cost: float, unit: float) -> float:
+    """Return the gain, in units (px^2) of the noise, that another kind of lens must have.
+
+    Infinite where a pinhole sees the picture as this one does: then its kind cannot be the reason.
+    """
+    if sees_as_pinhole(found.camera):
+        return np.inf
+    px = LEAST_KIND_PX * found.camera.image_size[0] / 1000
+    observations = sum(int(scene.tracks.seen.sum()) for scene in found.scenes)
+    return max(LEAST_KIND_GAIN * cost, px**2 * observations / unit)
 
 
 def is_clear(gains: Floats, least: float = LEAST_GAIN) -> bool:
@@ -195,8 +215,8 @@ def fixed_camera_tests(found: Estimate) -> tuple[FixedCameraTest, ...]:
     variance, count = now.noise(loss_px).variance, len(now.imaging.names)
     shift, zoom = now.imaging.blocks.get(Shift.name, Shift()), Zoom()
     asked = now.having(shift, zoom, Bend())
-    normals = [normal_equations(linearised(each, loss_px), variance * now.inflation,
-                                (shift.name, zoom.name), tracks=True) for each in asked.seen]
+    normals = [normal_equations(each, variance * now.inflation, (shift.name, zoom.name),
+                                tracks=True) for each in asked.linear(loss_px)]
     prior, own = asked.imaging.prior(), np.arange(count)
 
     def solved(block: Block | None, places: Ints) -> _Step:
@@ -269,8 +289,8 @@ def shift_size(found: Estimate) -> float:
     now = found.with_tracks(FIRST_TRACKS)
     loss_px = now.loss_px()
     unit = now.noise(loss_px).variance * now.inflation
-    normals = [normal_equations(linearised(each, loss_px), unit, (Shift.name,))
-               for each in now.having(Shift()).seen]
+    normals = [normal_equations(each, unit, (Shift.name,))
+               for each in now.having(Shift()).linear(loss_px)]
     prior = now.imaging.prior()
 
     def nats(block: Shift | None) -> float:
@@ -307,8 +327,8 @@ def drifting(found: Estimate) -> Drift | None:
     now = found.with_tracks(FIRST_TRACKS).having(sizes[0])
     loss_px = now.loss_px()
     unit = now.noise(loss_px).variance * now.inflation
-    total = Quadratic.together([normal.cost.at_noise(unit) for normal in now.normals(
-        loss_px, unit, safe=False)])
+    total = Quadratic.together([normal_equations(each, unit).cost.at_noise(unit)
+                                for each in now.linear(loss_px)])
     best = likeliest(total, now.imaging, sizes, DRIFT_NATS)
     return best if isinstance(best, Drift) and best.sigma > STEADY else None
 

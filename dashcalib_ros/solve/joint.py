@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dashcalib_ros.camera import AUTO, Camera, searched
+from dashcalib_ros.arrays import Floats
+from dashcalib_ros.camera import AUTO, PINHOLE, Camera, searched
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.problem.blocks import (
@@ -55,7 +56,7 @@ from dashcalib_ros.solve.start import (
     with_better_poses,
     with_poses_of,
 )
-from dashcalib_ros.solve.written import closest, written
+from dashcalib_ros.solve.written import Written, closest, sees_as_pinhole, written
 
 Progress = Callable[[str, float], None]
 
@@ -240,8 +241,8 @@ def _chosen(begun: Sequence[_Begun], config: Config
     """Return the kind of lens that explains the turns best, and how the kinds compare.
 
     A kind may lose by the bad poses of one turn only. So the others are found again from the poses
-    of the best one; so is one that no turn began with, where the best one leaves much to explain.
-    Where a model was asked for, that one stays.
+    of the best one; so is one that no turn began with, where the best one leaves much to explain,
+    and a pinhole where that sees the same. Where a model was asked for, that one stays.
     """
     best = next(each for each in begun
                 if each.found is chosen_kind([other.found for other in begun])[0])
@@ -252,7 +253,8 @@ def _chosen(begun: Sequence[_Begun], config: Config
         if model.family == best.found.camera.family:
             continue
         own = [each for each in begun if each.found.camera.family == model.family]
-        if own or config.model != AUTO or _much_is_left(best.found):
+        if (own or config.model != AUTO or _much_is_left(best.found)
+                or (model.family == PINHOLE and sees_as_pinhole(best.found.camera))):
             rivals += own
             with suppress(np.linalg.LinAlgError):
                 camera = closest(best.found.imaging, model, best.found.scenes)
@@ -388,4 +390,12 @@ def _solution(found: Estimate, unlike: Mapping[TurnId, float], coarse: Profile,
         fixed_camera=tests, field_sigma=found.imaging.smooth.sigma,
         crops={} if shift.only else dict(shift.value),
         perhaps_shifted=shift.only or frozenset(), fixed=config.known.stabiliser == 'no',
-        converged=found.converged)
+        unsettled=_unsettled(result, posterior.covariance, found.last))
+
+
+def _unsettled(result: Written, covariance: Floats, last: Floats) -> float:
+    """Return how far a step (m,) moves the rays over the picture, in units of their sigma."""
+    if not len(last):
+        return 0.0
+    moved = np.sqrt(np.mean(np.sum((result.moves @ last)**2, axis=1)))
+    return float(moved / result.sigma_map(covariance, with_field=True).whole.rms)

@@ -20,6 +20,7 @@ from dashcalib_ros.problem.blocks import (
     Shift,
     bounds_of,
 )
+from dashcalib_ros.problem.normal import Linear, normal_equations
 from dashcalib_ros.problem.quadratic import Quadratic
 from dashcalib_ros.reconstruct.scene import Scene, errors_px, retriangulated
 
@@ -124,28 +125,38 @@ def optimised(start: Estimate, least_px: float, count: int, settled: float = ste
     """
     loss_px = start.loss_px(least_px)
 
-    def chosen(now: Estimate, n: int) -> Estimate:
+    def chosen(now: Estimate, linear: Sequence[Linear], n: int) -> Estimate:
         # sizes hardly change from step to step
-        return now if not choose or n % 2 else _with_sizes_chosen(now, loss_px)
+        return now if not choose or n % 2 else _with_sizes_chosen(now, linear, loss_px)
 
     return steps.optimised(start, steps.Stepping(loss_px, count, settled=settled), chosen)
 
 
-def _with_sizes_chosen(now: Estimate, loss_px: float) -> Estimate:
+def _with_sizes_chosen(now: Estimate, linear: Sequence[Linear], loss_px: float) -> Estimate:
     """Return the estimate with the sizes of noise and priors that the evidence favours."""
     noise = now.noise(loss_px)
-    normals = now.normals(loss_px, noise.variance * now.inflation, tracks=True, images=True)
-    total = Quadratic.together([normal.cost.at_noise(noise.variance).curved(noise.curvature)
-                                for normal in normals])
-    now = replace(now, inflation=inflation_of(total, now.imaging.prior()))
-    total = total.at_noise(now.inflation)
+    total = Quadratic.together([
+        cost.at_noise(noise.variance).curved(noise.curvature)
+        for cost in costs_by_track(linear, noise.variance * now.inflation)])
+    inflation = inflation_of(total, now.imaging.prior())
+    total = total.at_noise(inflation)
     smooth, width = now.imaging.smooth, now.camera.image_size[0]
     fields = [replace(smooth, sigma=size * width / 1000) for size in FIELD_SIZES]
-    now = now.having(likeliest(total, now.imaging, fields))
-    square = replace(now.imaging.lens, aspect_sigma=now.config.intrinsics.aspect_sigma)
+    imaging = now.imaging.having(likeliest(total, now.imaging, fields))
+    square = replace(imaging.lens, aspect_sigma=now.config.intrinsics.aspect_sigma)
     loose = replace(square, aspect_sigma=NOT_SQUARE)
-    return now.having(square if square.aspect_sigma >= NOT_SQUARE else likeliest(
-        total, now.imaging, [square, loose], NOT_SQUARE_NATS))
+    return now.sized(imaging.having(square if square.aspect_sigma >= NOT_SQUARE else likeliest(
+        total, imaging, [square, loose], NOT_SQUARE_NATS)), inflation)
+
+
+def costs_by_track(linear: Sequence[Linear], unit: float) -> list[Quadratic]:
+    """Return the cost of each stretch, each track being one measurement.
+
+    What observations of one image share counts, too, where its picture is not shifted.
+    """
+    return [normal_equations(each, unit, tracks=True, images=all(
+        block.turns for block in each.imaging.of_each_image(each.stretch))).cost
+        for each in linear]
 
 
 def other_shape_of_pixels(now: Estimate) -> tuple[tuple[float, Quadratic], ...]:

@@ -21,9 +21,6 @@ from dashcalib_ros.solve.written import Written, written
 
 # fewer turns are not left out: one of two says little of the other
 LEAST_TURNS = 3
-# cost_ratio of the kinds of lenses: behind true fisheyes pinholes have 1.15 to 2, each with a
-# field of its own; behind windscreens fisheyes have 1.01 to 1.06
-CLEAR_KIND_RATIO = 1.08
 
 
 @dataclass(frozen=True)
@@ -55,8 +52,8 @@ class Solution:
     picture; empty for a fixed picture. perhaps_shifted: turns so gentle that a stabiliser might
     have shifted their pictures: each may be, and sigma contains it. fixed: it is known that there
     is no stabiliser. drift: of the focal length, which is that of the middle of the drive then.
-    converged: whether the last
-    steps reached the optimum. field_sigma: px, of the prior of the field's directions.
+    unsettled: how far the last step moved the rays over the picture, in
+    their sigma. field_sigma: px, of the prior of the field's directions.
     by_pictures: the solution of the pictures alone, where a gyro's angles are in this one. px: of
     the input's pictures, in one pixel of the scenes.
     """
@@ -77,7 +74,7 @@ class Solution:
     perhaps_shifted: frozenset[TurnId] = frozenset()
     fixed: bool = False
     drift: FocalDrift | None = None
-    converged: bool = True
+    unsettled: float = 0.0
     field_sigma: float = 0.0
     by_pictures: Solution | None = None
     px: float = 1.0

@@ -25,7 +25,7 @@ from dashcalib_ros.reconstruct.scene import (
     retriangulated,
     truncated_cost,
 )
-from dashcalib_ros.solve.optimise import FIRST_TRACKS, loss_px_of, subsample_tracks
+from dashcalib_ros.solve.optimise import loss_px_of, subsample_tracks
 
 # factors of the resulting focal length at which the profile is evaluated
 PROBES = (0.8, 1.0, 1.25)
@@ -86,11 +86,6 @@ def retriangulate(scene: Scene, camera: Camera, config: SceneConfig) -> Scene:
 def rechain(scene: Scene, camera: Camera, config: Config) -> Scene | None:
     """Return the scene chained anew from its tracks, None if no pair of images starts a chain."""
     return chain_scene(scene.tracks, scene.turn, camera, scene.profile, config)
-
-
-def with_few_tracks(scene: Scene) -> Scene:
-    """Return the scene with a part of its tracks, enough for all but the result."""
-    return subsample_tracks(scene, FIRST_TRACKS)
 
 
 def with_poses_of(scene: Scene, part: Scene) -> Scene:

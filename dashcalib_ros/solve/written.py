@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 
 from dashcalib_ros.arrays import Floats
-from dashcalib_ros.camera import AUTO, Camera, calibrated_models
+from dashcalib_ros.camera import AUTO, PINHOLE, Camera, calibrated_models
 from dashcalib_ros.camera.field import Field, field_terms
 from dashcalib_ros.camera.mapping import grid_of, turned
-from dashcalib_ros.problem.blocks import Imaging, Lens, Smooth, displacements
+from dashcalib_ros.problem.blocks import Imaging, Lens, Smooth, displacements, lens_alone
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve.spread import SigmaMap, sigma_over
 
@@ -33,6 +33,8 @@ RIDGE = 1e-6
 # chi-squared of each further coefficient; less, and nobody sees it. And px RMS of 1000 px of
 # width, by which they may move the picture all the same
 SEEN, LEAST_APART = 3.0, 0.02
+# px RMS of 1000 px of width by which the closest pinhole is off a camera that might be one
+AS_PINHOLE = 0.1
 # px RMS of 1000 px of width; a smaller field is none
 LEAST_FIELD = 0.02
 
@@ -116,9 +118,7 @@ def written(imaging: Imaging, covariance: Floats, scenes: Sequence[Scene], model
     places = _places(imaging, np.concatenate([tracks, grid]), np.concatenate([
         np.full(len(tracks), (1 - GRID_WEIGHT) / len(tracks)),
         np.full(len(grid), GRID_WEIGHT / len(grid))]))
-    of_kind = [each for each in calibrated_models() if each.family == imaging.camera.family]
-    of_kind.sort(key=lambda each: len(each.names()))
-    fits = [_fit(imaging, places, each) for each in of_kind]
+    fits = [_fit(imaging, places, each) for each in _of_kind(imaging.camera.family)]
     apart = [_rms(each.off - fits[-1].off, places.weights) for each in fits]
     chosen = next(n for n, each in enumerate(fits)
                   if (each.camera.model == model if model != AUTO else
@@ -132,6 +132,22 @@ def closest(imaging: Imaging, model: type[Camera], scenes: Sequence[Scene]) -> C
     tracks = np.concatenate([scene.tracks.xy[scene.structure.used] for scene in scenes])
     places = _places(imaging, tracks[::max(1, len(tracks) // PLACES)])
     return _fit(imaging, places, model).camera
+
+
+def sees_as_pinhole(camera: Camera) -> bool:
+    """Return whether a pinhole sees the whole picture nearly as this camera does."""
+    alone = lens_alone(camera)
+    places, widest = _places(alone, grid_of(camera)), _of_kind(PINHOLE)[-1]
+    fit = _fit(alone, places, widest)
+    unseen = ~np.isfinite(fit.camera.project(places.rays @ fit.rotation.T)).all()
+    limit_px = AS_PINHOLE * camera.image_size[0] / 1000
+    return not unseen and _rms(fit.off, places.weights) < limit_px
+
+
+def _of_kind(family: str) -> list[type[Camera]]:
+    """Return the models of a kind that turns determine, the simplest first."""
+    return sorted((each for each in calibrated_models() if each.family == family),
+                  key=lambda each: len(each.names()))
 
 
 def _places(imaging: Imaging, pixels: Floats, weights: Floats | None = None) -> _Places:

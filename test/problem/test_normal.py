@@ -174,7 +174,7 @@ def test_there_is_no_gradient_at_the_optimum():
         """Return how far the least cost is, in sigmas of the parameter that is farthest."""
         noise = now.noise(loss_px).variance * now.inflation
         total = Quadratic.together([now.imaging.prior(), *(
-            normal.cost.at_noise(noise) for normal in now.normals(loss_px, noise, safe=False))])
+            normal_equations(each, noise).cost.at_noise(noise) for each in now.linear(loss_px))])
         return float(np.abs(total.optimum / np.sqrt(np.diag(total.covariance))).max())
 
     assert pull(optimised(start, 0.0, 20, settled=1e-6)) < 0.05 < 0.3 < pull(start)

@@ -175,12 +175,12 @@ def test_equations_without_a_solution_move_nothing(monkeypatch):
     assert moved == lens.camera
 
 
-def test_the_optimum_says_that_it_is_one():
+def test_the_last_step_says_how_near_the_optimum_is():
     camera = LENSES['radial']
     off = camera.with_params(camera.params + [0, 0, 0, 0, 0.1, 0])
     start, lens = stretch_of(camera), free(off, 4, 5)
 
-    def after(steps: int) -> State:
-        return optimised(State(Imaging.of(lens), (start,)), Stepping(LOSS_PX, steps, settled=0.04))
+    def after(steps: int) -> np.ndarray:
+        return optimised(State(Imaging.of(lens), (start,)), Stepping(LOSS_PX, steps)).last
 
-    assert not after(1).converged and after(20).converged
+    assert np.abs(after(20)).max(initial=0.0) < 1e-4 < 0.02 < np.abs(after(1)).max()

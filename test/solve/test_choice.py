@@ -139,19 +139,38 @@ def test_a_pinhole_that_all_turns_were_taken_for_a_fisheye_is_one():
     assert found.camera.family == 'pinhole' and mapping_error(found.camera, LENS) < 1.0
 
 
-@pytest.mark.parametrize(('k1', 'chosen'), [(LENS.k1, Radial), (-0.6, Fisheye)],
-                         ids=['a lens', 'it folds over'])
-def test_a_pinhole_that_folds_over_loses_to_a_fisheye_that_is_a_little_better(
-        monkeypatch, k1, chosen):
-    kinds = [SimpleNamespace(camera=camera, inflation=1.0, loss_px=lambda: 1.0,
-                             noise=lambda loss_px: SimpleNamespace(variance=1.0))
-             for camera in (replace(LENS, k1=k1), WIDE)]
-    costs = {Radial: 1000.0, Fisheye: 970.0}
+NARROW = Radial(SIZE, 720.0, 721.0, 407.0, 219.0, -0.25, 0.08)
+
+
+@pytest.mark.parametrize(('pinhole', 'fisheye', 'costs', 'noise_px', 'chosen'), [
+    (LENS, WIDE, (1000.0, 970.0), 1.0, Radial),
+    (replace(LENS, k1=-0.6), WIDE, (1000.0, 970.0), 1.0, Fisheye),
+    (LENS, WIDE, (1000.0, 500.0), 0.03, Fisheye),
+    (LENS, WIDE, (1000.0, 500.0), 0.003, Radial),
+    (NARROW, as_model(NARROW, Fisheye), (1000.0, 500.0), 0.03, Radial)], ids=[
+        'a little better', 'the pinhole folds over', 'much better', 'by what is no pixel',
+        'but alike'])
+def test_a_fisheye_must_be_better_by_what_only_a_fisheye_can_be(
+        monkeypatch, pinhole, fisheye, costs, noise_px, chosen):
+    seen = SimpleNamespace(tracks=SimpleNamespace(seen=np.ones((20, 100), bool)))
+    kinds = [SimpleNamespace(camera=camera, inflation=1.0, loss_px=lambda: 1.0, scenes=[seen] * 3,
+                             noise=lambda loss_px: SimpleNamespace(variance=noise_px**2))
+             for camera in (pinhole, fisheye)]
+    of_kind = dict(zip((Radial, Fisheye), costs, strict=True))
     monkeypatch.setattr(evidence, 'costs_left_out', lambda kind, loss_px: dict.fromkeys(
-        map(TurnId.at, range(3)), costs[type(kind.camera)]))
+        map(TurnId.at, range(3)), of_kind[type(kind.camera)]))
     found, tried = evidence.chosen_kind(kinds)
     assert type(found.camera) is chosen
     assert [each.chosen for each in tried] == [kind is found for kind in kinds]
+
+
+def test_a_narrow_lens_that_all_turns_took_for_a_fisheye_is_a_pinhole():
+    # in the field of a fisheye p1 and p2 become an error of the centre
+    extra = (0.003, -0.003, 0.02)
+    found = solved(scenes_of(3, NARROW, start=as_model(NARROW, Fisheye), extra=extra, tracks=120,
+                             keyframes=12))
+    assert type(found.camera) is Brown
+    assert (np.abs(found.camera.params - [*NARROW.params, *extra])[:4] < 3 * found.sigma[:4]).all()
 
 
 @pytest.mark.parametrize(('ratio', 'sigmas', 'doubted'), [

@@ -386,6 +386,13 @@ def test_a_distortion_that_folds_over(good):
     assert level != 'accepted' and 'E-FOLDS-OVER' in reasons
 
 
+@pytest.mark.parametrize(('last', 'at_rest'), [(0.4, True), (0.6, False)])
+def test_a_search_that_did_not_come_to_rest_is_weak(good, last, at_rest):
+    assert good.unsettled < 0.1
+    level, reasons = levels(replace(good, unsettled=last))
+    assert (level == 'accepted') == at_rest == ('E-NOT-CONVERGED' not in reasons)
+
+
 def test_refused_tells_the_doubts_too(good):
     solution = replace(changed(good, k1=-0.5, k2=0.0), around=replace(
         good.around, costs=np.ones_like(good.around.costs)))
