@@ -19,12 +19,15 @@ if TYPE_CHECKING:
     )
     from dashcalib_ros.formats import load_camera
     from dashcalib_ros.formats.export import export
+    from dashcalib_ros.formats.rig import load_rig
     from dashcalib_ros.input import Frame
     from dashcalib_ros.input.inputs import open_frames
     from dashcalib_ros.judge import Check
     from dashcalib_ros.pipeline import Calibrator
     from dashcalib_ros.report import AcceptedCalibration, Calibration, NamedCamera, Verdict
     from dashcalib_ros.report.compare import Comparison, compare
+    from dashcalib_ros.rig.placed import RigCalibration
+    from dashcalib_ros.rig_session import calibrate_rig
     from dashcalib_ros.session import calibrate, check
 
     __version__: str
@@ -37,11 +40,14 @@ os.environ.setdefault('OPENCV_IO_MAX_IMAGE_PIXELS', str(PIXELS))
 __all__ = ['AcceptedCalibration', 'Brown', 'Calibration', 'Calibrator', 'Camera', 'Check',
            'Comparison', 'Config', 'ConfigError', 'DashcalibError', 'Fisheye', 'Frame',
            'InputError', 'NamedCamera', 'NotAcceptedError', 'OutputError', 'Radial', 'Rational',
-           'Verdict', 'WorkerError', '__version__', 'calibrate', 'check', 'compare', 'export',
-           'load_camera', 'open_frames']
+           'RigCalibration', 'Verdict', 'WorkerError', '__version__', 'calibrate',
+           'calibrate_rig', 'check', 'compare', 'export', 'load_camera', 'load_rig',
+           'open_frames']
 
 _HOMES = {'Calibrator': 'pipeline', 'Check': 'judge', 'Comparison': 'report.compare',
           'Config': 'config', 'Frame': 'input', 'calibrate': 'session', 'check': 'session',
+          'calibrate_rig': 'rig_session', 'RigCalibration': 'rig.placed',
+          'load_rig': 'formats.rig',
           'export': 'formats', 'load_camera': 'formats', 'open_frames': 'input.inputs',
           **dict.fromkeys(('AcceptedCalibration', 'Calibration', 'NamedCamera', 'Verdict',
                            'compare'), 'report'),

@@ -240,6 +240,20 @@ class VerdictConfig:
 
 
 @dataclass(frozen=True)
+class RigConfig:
+    """Several cameras of one car: largest sigmas of what is accepted; up to ten times is weak."""
+
+    rotation_deg: float = expert(
+        0.2, 'degrees about an axis; at 20 m it is 7 cm, and mountings are known no better',
+        0.01, 5.0)
+    translation_m: float = expert(
+        0.1, 'm along an axis; a tape measure is as good', 0.001, 5.0)
+    clock_s: float = expert(
+        0.005, 's; at 20 m/s it is 10 cm, and half the time between rows of most shutters',
+        1e-4, 1.0)
+
+
+@dataclass(frozen=True)
 class FleetConfig:
     """Many cameras: dashcalib batch."""
 
@@ -310,6 +324,7 @@ class Config:
     mount: MountConfig = field(default_factory=MountConfig)
     verdict: VerdictConfig = field(default_factory=VerdictConfig)
     monitor: MonitorConfig = field(default_factory=MonitorConfig)
+    rig: RigConfig = field(default_factory=RigConfig)
     fleet: FleetConfig = field(default_factory=FleetConfig)
 
     def __post_init__(self) -> None:

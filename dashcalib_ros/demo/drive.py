@@ -45,7 +45,9 @@ class Drive:
         self.course: Course = course_of(spec)
         self.ride: Ride = ride_of(self.course, spec)
         usable = self.ride.duration - 2.0 * MARGIN_S
-        self.times: Floats = np.arange(math.floor(usable * spec.rate) + 1) / spec.rate
+        first = 0.0 if spec.mounting is None else spec.mounting.phase_s
+        self.times: Floats = first + np.arange(
+            math.floor((usable - first) * spec.rate) + 1) / spec.rate
 
     def __len__(self) -> int:
         return int(self.times.size)
@@ -125,7 +127,10 @@ class Drive:
 
     def stamp_ns(self, index: int) -> int:
         """Return a frame's time stamp in nanoseconds."""
-        return START_NS + round(index * 1e9 / self.spec.rate)
+        seconds = index / self.spec.rate
+        if (own := self.spec.mounting) is not None:
+            seconds = own.late_s + seconds * (1 + 1e-6 * own.clock_ppm)
+        return START_NS + round(seconds * 1e9)
 
     @cached_property
     def shading(self) -> Floats32:

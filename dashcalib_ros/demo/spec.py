@@ -31,6 +31,26 @@ class Stop:
 
 
 @dataclass(frozen=True)
+class Mounting:
+    """Where one of several cameras sits on the car, and its clock.
+
+    yaw_left_deg, pitch_up_deg, roll_right_deg: where it looks. ahead_m, left_m: of the middle of
+    the rear axle; height_m. phase_s: when it takes its first picture; late_s: added to its stamps,
+    and clock_ppm: by how much more time passes between them.
+    """
+
+    yaw_left_deg: float = 0.0
+    pitch_up_deg: float = 0.0
+    roll_right_deg: float = 0.0
+    ahead_m: float = 1.7
+    left_m: float = 0.1
+    height_m: float = 1.4
+    phase_s: float = 0.0
+    late_s: float = 0.0
+    clock_ppm: float = 0.0
+
+
+@dataclass(frozen=True)
 class DriveSpec:
     """A drive; the same spec and lens give the same pictures.
 
@@ -50,6 +70,7 @@ class DriveSpec:
     moving_cars: oncoming, leading and crossing ones.
     stops: red lights. night: dark and noisy. flicker: RMS of the exposure's relative variation.
     jpeg_quality: compress as a dashcam would; None does not.
+    mounting: of this camera, in the place of height_m and mount_deg; None: made up from the seed.
     kind: 'parked' stands still and 'spin' turns on the spot, both for duration_s.
     """
 
@@ -79,6 +100,7 @@ class DriveSpec:
     night: bool = False
     flicker: float = 0.01
     jpeg_quality: int | None = None
+    mounting: Mounting | None = None
     kind: Kind = 'drive'
     duration_s: float = 10.0
 

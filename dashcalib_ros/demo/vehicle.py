@@ -100,7 +100,11 @@ def ride_of(course: Course, spec: DriveSpec) -> Ride:
     lever = np.array([AHEAD_M, ASIDE_M, spec.height_m])
     if spec.kind == 'spin':
         lever[:2] = 0.0
-    return Ride(t, s, x, y, lift, yaw, pitch, roll, lever, _mount(rng, spec.mount_deg))
+    mount = _mount(rng, spec.mount_deg)
+    if (own := spec.mounting) is not None:
+        lever = np.array([own.ahead_m, own.left_m, own.height_m])
+        mount = _mounted(*np.radians([own.yaw_left_deg, -own.pitch_up_deg, own.roll_right_deg]))
+    return Ride(t, s, x, y, lift, yaw, pitch, roll, lever, mount)
 
 
 def _timetable(course: Course, spec: DriveSpec) -> tuple[Floats, Floats]:
@@ -139,8 +143,12 @@ def _undulation(rng: np.random.Generator, s: Floats, rms: float, shortest_m: flo
 
 def _mount(rng: np.random.Generator, most_deg: float) -> Floats:
     """Return (3, 3) body from camera: nearly straight ahead, as stuck on by hand."""
+    return _mounted(*np.radians(most_deg * rng.uniform(-1.0, 1.0, 3)))
+
+
+def _mounted(yaw: float, pitch: float, roll: float) -> Floats:
+    """Return (3, 3) body from camera, turned to the left, downwards and clockwise, rad."""
     axes = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    yaw, pitch, roll = np.radians(most_deg * rng.uniform(-1.0, 1.0, 3))
     turned = _rotation_z(np.array([yaw])) @ _rotation_y(np.array([pitch]))
     return np.asarray((turned @ _rotation_x(np.array([roll])))[0] @ axes)
 

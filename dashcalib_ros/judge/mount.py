@@ -188,7 +188,7 @@ def _poses_of_pairs(camera: Camera, straights: Straights) -> _Pairs:
     hessian, errors = np.tile(np.eye(5), (count, 1, 1)), np.zeros(seen.shape)
     weights = np.zeros(seen.shape)
     for step in range(STEPS):
-        errors, slopes, tangents = _epipolar(turned, back, first, second)
+        errors, slopes, tangents = epipolar(turned, back, first, second)
         loss = unit * max(LAST_PX, FIRST_PX * NARROWING**step)
         weights = seen * cauchy_weights(errors, loss)
         weighted = (weights[..., None] * slopes).transpose(0, 2, 1)
@@ -213,7 +213,7 @@ def _poses_of_pairs(camera: Camera, straights: Straights) -> _Pairs:
                   np.degrees(vector[:, 1]) / straights.apart_s, np.asarray(rear, bool))
 
 
-def _epipolar(turned: Floats, back: Floats, first: Floats, second: Floats
+def epipolar(turned: Floats, back: Floats, first: Floats, second: Floats
               ) -> tuple[Floats, Floats, Floats]:
     """Return rays' errors, their slopes by (turn, direction), and the directions' tangents.
 

@@ -266,6 +266,33 @@ def normal_equations(linear: Linear, variance: float = 1.0, kept: Sequence[str] 
                   float(right[:, -1] @ solved[:, -1] - whole[-1, -1]))
 
 
+@dataclass(frozen=True)
+class PosesGivenShared:
+    """What a stretch says of its k poses where what is shared is known, the points eliminated.
+
+    covariance: (6k, 6k) without the gauge, which is free; follow: (6k, g) of the poses by what is
+    shared.
+    """
+
+    covariance: Floats
+    follow: Floats
+
+
+def poses_given_shared(linear: Linear, variance: float) -> PosesGivenShared:
+    """Return what a stretch without blocks of images says of its poses; variance: px^2."""
+    whole, _ = _without_points(linear, np.inf)
+    poses, count = linear.extras['pose'], POSE * len(linear.images)
+    if linear.follow is not None:
+        motion = linear.extras['motion']
+        whole[:, poses] += whole[:, motion] @ linear.follow
+        whole[poses] += linear.follow.T @ whole[motion]
+    inner, shared = whole[np.ix_(poses, poses)], whole[poses, linear.own * len(linear.images):-1]
+    right = np.concatenate([variance * np.eye(count), shared], axis=1)
+    solved = _pose_solution(inner, right, linear.stretch)
+    covariance = solved[:, :count]
+    return PosesGivenShared((covariance + covariance.T) / 2, -solved[:, count:])
+
+
 def damping(diagonals: Floats, radius: float) -> Floats:
     """Return what is added to the diagonals of normal equations; 0 where they are trusted."""
     return np.asarray(np.clip(diagonals, LEAST, GREATEST) / radius)

@@ -2,16 +2,18 @@
 """The path of a camera through the poses of its keyframes: how fast it turns and moves at each.
 
 A cubic spline goes through the centres of the camera, and one through the rotation vectors from
-each keyframe to all. The rows of a rolling shutter are exposed along it.
+each keyframe to all. The rows of a rolling shutter are exposed along it, and another camera of the
+same car, whose images have times of their own, moves along it.
 """
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Ints, Mask
+from dashcalib_ros.camera.rotation import rotation_matrices
 
 # knots at the least, from which a spline says how the camera moved
 LEAST_KNOTS = 4
@@ -64,6 +66,38 @@ class Trajectory:
             moving[self.rows] = -np.einsum('kab,kb->ka', self.rotations, slopes @ self._centres)
         return turning, moving
 
+    def later(self, seconds: float) -> Trajectory:
+        """Return the same path, driven so much later."""
+        return replace(self, seconds=self.seconds + seconds)
+
+    def at(self, seconds: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return the poses at times (n,): rotations (n, 3, 3), translations (n, 3), derivatives.
+
+        These are (n, 6, k, 6) by the moves of the k knots; a move is a small rotation in a pose's
+        own axes, and one of its translation. The path must move.
+        """
+        near = np.abs(seconds[:, None] - self.seconds).argmin(axis=1)
+        weights, each = _weights(tuple(self.seconds.tolist()), seconds), np.arange(len(near))
+        angles = self._angles[near]
+        angle = np.einsum('nk,nkc->nc', weights, angles)
+        turned = rotation_matrices(angle)
+        rotations = turned @ self.rotations[near]
+        translations = -np.einsum('nab,nb->na', rotations, weights @ self._centres)
+        by_knots = np.zeros((len(near), 6, len(self.seconds), 6))
+        crossed = cross(angles.reshape(-1, 3)).reshape(*weights.shape, 3, 3)
+        by_turn = weights[:, :, None, None] * (np.eye(3) - crossed / 2 + crossed @ crossed / 12)
+        by_angle = by_turn.transpose(0, 2, 1, 3).copy()
+        by_angle[each, :, near] -= np.sum(by_turn @ self._relative[near], axis=1)
+        left = np.eye(3) + cross(angle) / 2
+        by_knots[:, :3, :, :3] = np.einsum('nab,nbjc->najc', left, by_angle)
+        by_knots[each, :3, near, :3] += turned
+        # of minus the centre, in the world's axes, by each knot's move
+        back = self.rotations.transpose(0, 2, 1)
+        shifted = np.concatenate([back @ cross(self.translations), back], axis=2)
+        by_knots[:, 3:] = np.einsum('nab,nj,jbc->najc', rotations, weights, shifted)
+        by_knots[:, 3:] -= np.einsum('nab,nbjc->najc', cross(translations), by_knots[:, :3])
+        return rotations, translations, by_knots
+
     def follow(self) -> Floats:
         """Return (count, 6, count, 6) derivatives of the keyframes' velocities by their moves."""
         found = np.zeros((self.count, 6, self.count, 6))
@@ -109,6 +143,20 @@ def _slopes(knots: tuple[float, ...]) -> Floats:
         left[end, end], left[end, next_one] = k, h + k
         right[end] = ((3 * h + 2 * k) * k * a + h * h * b) / (h + k)
     return np.asarray(np.linalg.solve(left, right))
+
+
+def _weights(knots: tuple[float, ...], seconds: Floats) -> Floats:
+    """Return (n, k) the spline's values at times (n,), by the values at all knots.
+
+    Beyond the ends the outer pieces go on.
+    """
+    times, slopes, unit = np.array(knots), _slopes(knots), np.eye(len(knots))
+    piece = np.clip(np.searchsorted(times, seconds, side='right') - 1, 0, len(times) - 2)
+    step = (times[piece + 1] - times[piece])[:, None]
+    u = (seconds - times[piece])[:, None] / step
+    return np.asarray((1 + 2 * u) * (1 - u)**2 * unit[piece] + u * (1 - u)**2 * step
+                      * slopes[piece] + u**2 * (3 - 2 * u) * unit[piece + 1]
+                      + u**2 * (u - 1) * step * slopes[piece + 1])
 
 
 def cross(vectors: Floats) -> Floats:

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""rig.json: the cameras of one car, where each sits, and what they see together."""
+from __future__ import annotations
+
+import json
+import os
+from typing import Any
+
+from dashcalib_ros.arrays import plain_values
+from dashcalib_ros.errors import InputError, Notice, one_line
+from dashcalib_ros.formats.ours import codes_of
+from dashcalib_ros.limits import JSON_BYTES, parse_json, path_of, read_text
+from dashcalib_ros.rig.placed import PlacedCamera, RigCalibration, Visible
+from dashcalib_ros.rig.witness import Epipolar
+
+RIG = 'rig.json'
+
+
+def rig_dict(rig: RigCalibration) -> dict[str, Any]:
+    """Return the content of rig.json: dicts, lists, text, finite numbers and None."""
+    plain: dict[str, Any] = plain_values({
+        'base': rig.base,
+        'cameras': {name: {**vars(camera), 'visible': vars(camera.visible),
+                           'reason_codes': codes_of(camera.reasons)}
+                    for name, camera in rig.cameras.items()},
+        'witness': {'epipolar_px': {f'{a}-{b}': vars(found)
+                                    for (a, b), found in rig.witness.items()}},
+        'warnings': rig.warnings, 'warning_codes': codes_of(rig.warnings)})
+    return plain
+
+
+def rig_json(rig: RigCalibration) -> str:
+    """Return rig.json's text."""
+    return json.dumps(rig_dict(rig), indent=2, allow_nan=False, ensure_ascii=False) + '\n'
+
+
+def load_rig(path: str | os.PathLike[str]) -> RigCalibration:
+    """Read a rig.json, or the one in a folder. Raises InputError."""
+    place = path_of(path)
+    place = place / RIG if place.is_dir() else place
+    data = parse_json(read_text(place, JSON_BYTES), str(place))
+    try:
+        cameras = {str(name): _camera(values) for name, values in data['cameras'].items()}
+        names = {f'{a}-{b}': (a, b) for a in cameras for b in cameras}
+        if data['base'] not in cameras:
+            raise ValueError(f'its base {data["base"]!r} is none of its cameras')
+        return RigCalibration(
+            data['base'], cameras,
+            {names[pair]: Epipolar(found['matches'], found['median'], found['cells_rms'])
+             for pair, found in data['witness']['epipolar_px'].items()},
+            _notices(data, 'warnings', 'warning_codes'))
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError('E-RIG-FILE', f'{place} is no rig.json of dashcalib, or damaged '
+                         f'({one_line(error)}); use the file that dashcalib rig wrote') from error
+
+
+def _camera(values: dict[str, Any]) -> PlacedCamera:
+    visible = values['visible']
+    return PlacedCamera(
+        str(values['calibration']), values['verdict'],
+        _three(values['rotation_deg']), _three(values['rotation_sigma_deg']),
+        _three(values['translation_m']), _three(values['translation_sigma_m']),
+        values['time_offset_s'], values['time_sigma_s'],
+        Visible(tuple(visible['rotation']), tuple(visible['translation']), visible['clock']),
+        _notices(values, 'reasons', 'reason_codes'))
+
+
+def _three(values: Any) -> tuple[float, float, float] | None:
+    if values is None:
+        return None
+    x, y, z = map(float, values)
+    return x, y, z
+
+
+def _notices(data: dict[str, Any], texts: str, codes: str) -> tuple[Notice, ...]:
+    return tuple(map(Notice, data.get(codes, ()), data.get(texts, ())))

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pose of every image of a stretch whose scene and lens are known.
+
+A lens needs keyframes far apart, a rig poses at times that its cameras share: between keyframes
+0.2 s apart a road shakes a car by a tenth of a degree, twenty times what a pose is known to.
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from dashcalib_ros.arrays import Mask
+from dashcalib_ros.config import Config
+from dashcalib_ros.detect.turn import Turn
+from dashcalib_ros.input import Frame
+from dashcalib_ros.problem.blocks import Imaging, Lens, Readout
+from dashcalib_ros.problem.observations import Structure
+from dashcalib_ros.problem.steps import FIRST_RADIUS, State, Stepping, optimised
+from dashcalib_ros.reconstruct.register import register_tracks
+from dashcalib_ros.reconstruct.scene import Scene, retriangulated
+from dashcalib_ros.reconstruct.tracks import spread, track_turn
+from dashcalib_ros.solve.solution import Solution
+
+# px: largest errors of the rounds; the first poses are interpolated
+ROUNDS_PX = (6.0, 2.0, 2.0)
+# before which tracks are registered against one patch each: what is followed from image to image
+# drifts, and turns a camera by a twentieth of a degree
+REGISTERED = 2
+# of each round
+STEPS = 12
+# tracks of a stretch: an image sees a few hundred of them
+TRACKS = 1200
+# times the median residual
+LOSS, LEAST_LOSS_PX = 1.0, 0.05
+
+
+def retraced(frames: Sequence[Frame], scene: Scene, solution: Solution, config: Config,
+             valid: Mask | None = None) -> Scene | None:
+    """Return a scene with all of these images as keyframes, and the solution's lens.
+
+    Its tracks are without the field, and as imaging_of() sees them. frames: resized as the
+    scene's, between its first and its last keyframe. None where they give no tracks.
+    """
+    turn = Turn(scene.turn.number, frames[0].index, frames[-1].index, 0.0, 0.0, tuple(frames))
+    tracks = track_turn(turn, replace(config.tracks, keyframe_motion=0.0), valid)
+    if not tracks.xy.shape[1]:
+        return None
+    tracks = spread(tracks, TRACKS)
+    if solution.field is not None:
+        xy, seen = tracks.xy.copy(), tracks.seen
+        xy[seen] = solution.field.ideal(xy[seen])
+        tracks = replace(tracks, xy=xy)
+    first_ns = scene.tracks.stamps_ns[scene.structure.registered][0]
+    rotations, translations, _ = scene.trajectory.at((tracks.stamps_ns - first_ns) / 1e9)
+    count = tracks.xy.shape[1]
+    found = replace(scene, tracks=tracks, camera=solution.camera, structure=Structure(
+        rotations, translations, np.zeros((count, 3)), np.ones(len(tracks.frames), bool),
+        np.zeros(tracks.seen.shape, bool)))
+    imaging = imaging_of(solution, held=True)
+    images = [frame.image for frame in frames]
+    for number, error_px in enumerate(ROUNDS_PX):
+        if number == REGISTERED:
+            tracks = register_tracks(tracks, found.structure, solution.camera, images)
+            found = replace(found, tracks=tracks)
+        whole = retriangulated(imaging.as_lens_sees(found), solution.camera, error_px,
+                              config.scene.min_angle_deg)
+        if not whole.structure.used.any():
+            return None
+        found = replace(whole, tracks=tracks)
+        state = State(imaging, (found,))
+        [moved] = optimised(state, Stepping(loss_of(state), STEPS, unit=1.0,
+                                            radius=FIRST_RADIUS)).stretches
+        found = replace(found, structure=moved.structure)
+    return found
+
+
+def loss_of(state: State) -> float:
+    """Return the scale of the Cauchy loss, px."""
+    off = np.concatenate([np.linalg.norm(seen.off, axis=1) for seen in state.seen])
+    return max(LOSS * float(np.median(off)), LEAST_LOSS_PX)
+
+
+def imaging_of(solution: Solution, held: bool = False) -> Imaging:
+    """Return what takes a solution's pictures, the field apart. held: nothing of it moves."""
+    return Imaging.of(Lens(solution.camera.widened(), held=held), Readout(
+        np.array([solution.readout_s]), held=held))

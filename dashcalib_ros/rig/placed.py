@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The result: where each camera sits, with a verdict for each degree of freedom."""
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from dashcalib_ros.arrays import Floats, Mask
+from dashcalib_ros.camera.rotation import rotation_matrices, rotation_vectors
+from dashcalib_ros.config import RigConfig
+from dashcalib_ros.errors import Notice
+from dashcalib_ros.judge.calibration import Level
+from dashcalib_ros.rig.joint import REACH_M, Solved
+from dashcalib_ros.rig.start import Aligned
+from dashcalib_ros.rig.witness import Epipolar
+
+Sight = Literal['accepted', 'weak', 'not visible']
+Three = tuple[float, float, float]
+Sights = tuple[Sight, Sight, Sight]
+NOTHING: Sights = ('not visible', 'not visible', 'not visible')
+
+# times the limit of what is accepted, up to which a degree of freedom is weak
+WEAK = 10.0
+# of the prior's sigma: where more of it is left, a translation is not visible
+PRIOR_LEFT = 0.5
+# degrees, m and s by which one stretch may be off beyond all that is known of it: of the real
+# pair (benchmark/results/rig.md) by 0.05 degrees about the optical axis, at a sigma of 0.01
+STRETCH = np.array([0.05, 0.05, 0.05, 0.02, 0.02, 0.02, 0.0005])
+# stretches at the least for what is accepted: one alone is confirmed by nothing
+LEAST_STRETCHES = 2
+# times its sigmas: stretches that differ by more contradict each other
+DISAGREE = 3.0
+AXES = ('x', 'y', 'z')
+
+
+@dataclass(frozen=True)
+class Visible:
+    """The verdict of each degree of freedom, in the order of the camera's axes."""
+
+    rotation: Sights = NOTHING
+    translation: Sights = NOTHING
+    clock: Sight = 'not visible'
+
+
+@dataclass(frozen=True)
+class PlacedCamera:
+    """Where a camera of a rig sits: x' = R x + t, from the base's optical axes to its own.
+
+    Optical axes: x to the right, y down, z forward. calibration: the path of its result.
+    rotation_deg: the rotation vector of R; its sigmas are of small rotations about this camera's
+    axes; None where no drive showed it. translation_m: t; None where no metres are known.
+    time_offset_s: to subtract from this camera's stamps for those of the base. verdict: of the
+    rotation. reasons: what is not accepted, and what would show it.
+    """
+
+    calibration: str
+    verdict: Level
+    rotation_deg: Three | None = None
+    rotation_sigma_deg: Three | None = None
+    translation_m: Three | None = None
+    translation_sigma_m: Three | None = None
+    time_offset_s: float | None = None
+    time_sigma_s: float | None = None
+    visible: Visible = Visible()
+    reasons: tuple[Notice, ...] = ()
+
+    @property
+    def rotation(self) -> Floats | None:
+        """Return R (3, 3); None where it is not known."""
+        if self.rotation_deg is None:
+            return None
+        return np.asarray(rotation_matrices(np.radians([self.rotation_deg]))[0])
+
+
+@dataclass(frozen=True)
+class RigCalibration:
+    """Cameras of one car. base: the name of the first; witness: by the names of two cameras."""
+
+    base: str
+    cameras: Mapping[str, PlacedCamera] = field(hash=False)
+    witness: Mapping[tuple[str, str], Epipolar] = field(default_factory=dict, hash=False)
+    warnings: tuple[Notice, ...] = ()
+
+    @property
+    def accepted(self) -> bool:
+        """Return whether the place of every camera is accepted."""
+        return all(camera.verdict == 'accepted' for camera in self.cameras.values())
+
+
+def base_camera(calibration: str, level: Level) -> PlacedCamera:
+    """Return the base, which sits at its own place."""
+    zero: Three = (0.0, 0.0, 0.0)
+    sure: Sights = ('accepted', 'accepted', 'accepted')
+    return PlacedCamera(calibration, 'weak' if level == 'refused' else 'accepted', zero, zero,
+                        zero, zero, 0.0, 0.0, Visible(sure, sure, 'accepted'))
+
+
+def not_placed(calibration: str, reason: Notice) -> PlacedCamera:
+    """Return a camera of which the drive shows nothing."""
+    return PlacedCamera(calibration, 'refused', reasons=(reason,))
+
+
+def why_not_aligned(name: str, base: str, found: Aligned | None, scenes: int) -> Notice:
+    """Return why a camera's turning does not fit the base's."""
+    if not scenes:
+        return Notice('E-RIG-NO-SCENES', f'{name}: no stretch of its drive could be '
+                      f'reconstructed: check its pictures, or drive turns past houses')
+    if found is None or found.turned == 0.0:
+        return Notice('E-RIG-NO-SHARED', f'{name} and {base} have no turn in common: check that '
+                      f'both clips are of one drive, and drive two turns that both see')
+    return Notice('E-RIG-OTHER-DRIVE', f'{name} does not turn when {base} does: at best '
+                  f'{max(100 * found.explained, 0):.0f} % of its turning is explained: check that '
+                  f'both clips are of one drive and one car')
+
+
+def placed(name: str, calibration: str, level: Level, solved: Solved, metric: bool,
+           clock: float, limits: RigConfig, doubts: Sequence[Notice] = ()) -> PlacedCamera:
+    """Return where a camera sits.
+
+    level: of its lens. metric: whether metres are known. clock: s by which its stamps begin after
+    the base's. doubts: what else keeps it from being accepted.
+    """
+    place, groups = solved.problem.places[name], solved.own[name]
+    sigma = solved.sigma(name)[:7] * np.r_[np.degrees(np.ones(3)), np.ones(4)]
+    sigma = np.hypot(sigma, STRETCH / np.sqrt(max(len(groups), 1)))
+    apart = solved.disagreement(name)[:7] > DISAGREE
+    most = np.repeat([limits.rotation_deg, limits.translation_m, limits.clock_s], (3, 3, 1))
+    alone = len(groups) < LEAST_STRETCHES or level == 'refused' or bool(doubts)
+    sights: list[Sight] = []
+    for value, limit, differs in zip(sigma, most, apart, strict=True):
+        if value > WEAK * limit:
+            sights.append('not visible')
+        else:
+            sights.append('weak' if value > limit or differs or alone else 'accepted')
+    for axis in range(3, 6):
+        if sigma[axis] > PRIOR_LEFT * REACH_M:
+            sights[axis] = 'not visible'
+        elif not metric:
+            sights[axis] = 'weak' if sights[axis] == 'accepted' else sights[axis]
+    visible = Visible((sights[0], sights[1], sights[2]), (sights[3], sights[4], sights[5]),
+                      sights[6])
+    verdict: Level = ('accepted' if set(visible.rotation) == {'accepted'} else
+                      'refused' if 'not visible' in visible.rotation else 'weak')
+    return PlacedCamera(
+        calibration, verdict,
+        _three(np.degrees(rotation_vectors(place.rotation[None])[0])), _three(sigma[:3]),
+        _three(place.translation_m) if metric else None,
+        _three(sigma[3:6]) if metric else None, place.late_s + clock, float(sigma[6]), visible,
+        (*doubts, *_reasons(name, visible, len(groups), level, apart, sigma, metric)))
+
+
+def _three(values: Floats) -> Three:
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+def _reasons(name: str, visible: Visible, stretches: int, level: Level, apart: Mask,
+             sigma: Floats, metric: bool) -> tuple[Notice, ...]:
+    """Return what is not accepted, and what would show it."""
+    found = []
+    if level == 'refused':
+        found.append(Notice('E-RIG-LENS', f'{name}: its lens is refused, so its rotation is weak '
+                            f'at best: drive turns in which it sees more'))
+    if stretches < LEAST_STRETCHES:
+        found.append(Notice('E-RIG-ONE-STRETCH', f'{name}: one stretch alone shows where it sits, '
+                            f'and nothing confirms it: drive more turns'))
+    if apart[:3].any():
+        found.append(Notice('E-RIG-DISAGREE', f'{name}: the stretches differ by more than their '
+                            f'sigmas: check that the camera was not moved during the drive'))
+    for part, sights, cure in (
+            ('rotation', visible.rotation, 'drive more turns, to the left and to the right'),
+            ('translation', visible.translation, 'a ramp or a kerb shows the height between two '
+             'cameras, turns show the rest, with --motion for metres')):
+        lacking = [axis for axis, sight in zip(AXES, sights, strict=True)
+                   if sight == 'not visible']
+        if lacking:
+            found.append(Notice(
+                f'E-RIG-{part.upper()}', f'{name}: its {part} along {", ".join(lacking)} is not '
+                f'visible on this drive: {cure}'))
+    if not metric:
+        found.append(Notice('E-RIG-NO-METRES', f'{name}: no metres are known, so it has no '
+                            f'translation: add a speed (--motion)'))
+    if visible.clock == 'not visible':
+        found.append(Notice('E-RIG-CLOCK', f'{name}: its clock is known to {sigma[6]:.3f} s only: '
+                            f'drive sharper turns'))
+    return tuple(found)

@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which scenes of cameras are of one time, and a rig to start from, in closed form.
+
+All cameras of a car turn with it at the same time, whatever they look at: the clocks of two of
+them are where their turning fits best. The rotation that takes one's turning, and its direction of
+travel, to the other's, is where the problem starts.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from dashcalib_ros.arrays import Floats
+from dashcalib_ros.rig.joint import UNKNOWN_UNIT, Gauge, Pair, Place, Problem, SceneKey
+from dashcalib_ros.rig.paths import CameraPaths, ScenePath
+
+# s between the offsets that are tried, first and then
+COARSE_S, FINE_S = 0.1, 0.01
+# of the squared turning in two scenes; cameras that share less do not turn alike
+LEAST_EXPLAINED = 0.8
+# radians that both turned together, at the least; and what the score of a wrong offset may reach
+LEAST_TURNED, RIVAL = np.radians(15.0), 0.8
+# s; farther from the best offset, another one is another alignment
+APART_S = 1.0
+# keyframes of a scene inside another one, at the least
+LEAST_SHARED = 6
+# m/s: where no speed is known, so fast a car goes
+USUAL_SPEED = 8.0
+# weight of a step's direction beside that of its turning, rad
+DIRECTION = 0.02
+
+# one sigma of a speed, and of the metres of a stretch that has no straight part
+SPEED_SIGMA, BENT_SIGMA = 0.01, 0.02
+# of a path's largest bend, below which it is straight: in a bend a camera is faster than a wheel
+UNBENT = 0.3
+
+# the speed of the car (n,), m/s, at times (n,) on the clock of the base
+Metres = Callable[[Floats], Floats]
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """How late a camera's clock is against another's; rotation (3, 3) from its axes.
+
+    explained: of the squared turning that both saw. turned: rad, of that. rival: the score of the
+    next best other alignment, of the best one's.
+    """
+
+    late_s: float
+    rotation: Floats
+    explained: float
+    turned: float
+    rival: float
+
+    @property
+    def found(self) -> bool:
+        """Return whether both cameras turn alike."""
+        return self.explained >= LEAST_EXPLAINED and self.turned >= LEAST_TURNED
+
+
+def aligned(camera: CameraPaths, base: CameraPaths, near_s: float | None = None
+            ) -> Aligned | None:
+    """Return how a camera's clock and axes fit to another's; None without any shared turning.
+
+    near_s: of how late it is, where both have one clock.
+    """
+    spans = [(own.seconds[0] - its.seconds[-1], own.seconds[-1] - its.seconds[0])
+             for own in camera.scenes for its in base.scenes]
+    if not spans:
+        return None
+    low, high = min(low for low, _ in spans), max(high for _, high in spans)
+    tried = np.arange(low, high + COARSE_S, COARSE_S)
+    tried = np.array([late for late in tried if any(a < late < b for a, b in spans)])
+    scores = np.array([_score(camera, base, late)[0] for late in tried])
+    if not len(scores) or scores.max() <= 0:
+        return None
+    # of alignments that fit as well, the one of a common clock
+    best = tried[int(np.argmax(scores))]
+    if near_s is not None and abs(best - near_s) > APART_S:
+        close = np.abs(tried - near_s) < APART_S
+        if close.any() and scores[close].max() > RIVAL * scores.max():
+            best = tried[close][int(np.argmax(scores[close]))]
+    others = scores[np.abs(tried - best) > APART_S]
+    fine = best + np.arange(-COARSE_S, COARSE_S + FINE_S, FINE_S)
+    late = float(max(fine, key=lambda each: _score(camera, base, each)[0]))
+    score, rotation, explained, turned = _score(camera, base, late)
+    return Aligned(late, rotation, explained, turned,
+                   max(float(others.max(initial=0.0)), 0.0) / max(score, 1e-12))
+
+
+def _shared(own: ScenePath, its: ScenePath, late: float) -> Floats:
+    """Return the times of a camera's keyframes, on its clock, that the other's scene has, too."""
+    return own.seconds[its.within(own.seconds - late)]
+
+
+def _score(camera: CameraPaths, base: CameraPaths, late: float
+           ) -> tuple[float, Floats, float, float]:
+    """Return the score of an offset, the rotation, the share explained, and the rad turned."""
+    turns, theirs, ways, their_ways = [], [], [], []
+    for own in camera.scenes:
+        for its in base.scenes:
+            seconds = _shared(own, its, late)
+            if len(seconds) >= LEAST_SHARED:
+                turns.append(own.turned(seconds))
+                theirs.append(its.turned(seconds - late))
+                ways.append(_unit(own.ahead(seconds)))
+                their_ways.append(_unit(its.ahead(seconds - late)))
+    if not turns:
+        return 0.0, np.eye(3), 0.0, 0.0
+    turn, its_turn = np.concatenate(turns), np.concatenate(theirs)
+    both = turn.T @ its_turn + DIRECTION**2 * (
+        np.concatenate(ways).T @ np.concatenate(their_ways))
+    u, _, v = np.linalg.svd(both)
+    rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ v))]) @ v
+    energy = float(np.sum(turn**2) + np.sum(its_turn**2)) / 2
+    left = float(np.sum((turn - its_turn @ rotation.T)**2))
+    explained = 1 - left / max(energy, 1e-12)
+    turned = float(sum(np.linalg.norm(each.sum(axis=0)) for each in turns))
+    return energy - left / (1 - LEAST_EXPLAINED), rotation, explained, turned
+
+
+def _unit(vectors: Floats) -> Floats:
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1), 1e-12)[:, None])
+
+
+def problem_of(cameras: Mapping[str, CameraPaths], base: str, found: Mapping[str, Aligned],
+               metres: Metres | None) -> Problem:
+    """Return the problem to start with. found: the cameras that are aligned with the base.
+
+    metres: of the car between two times; None: unknown.
+    """
+    names = [base, *found]
+    middles = {name: float(np.mean([np.mean(scene.seconds) for scene in cameras[name].scenes]))
+               for name in names}
+    places = {base: Place()} | {
+        name: Place(each.rotation, late_s=each.late_s, middle_s=middles[name])
+        for name, each in found.items()}
+    pairs: list[Pair] = []
+    for name in found:
+        for n in range(len(cameras[name].scenes)):
+            key = (name, n)
+            pairs += [pair for m in range(len(cameras[base].scenes))
+                      if (pair := _pair(cameras, places, (base, m), key)) is not None]
+    known = {key: _unit_of(cameras[key[0]].scenes[key[1]], metres)
+             for key in dict.fromkeys(pair.reference for pair in pairs)}
+    used = {name for pair in pairs for name in (pair.reference[0], pair.other[0])} | {base}
+    return Problem({name: cameras[name] for name in names if name in used}, base,
+                   {name: place for name, place in places.items() if name in used},
+                   {key: value for key, (value, _) in known.items()}, known,
+                   {name: np.zeros(len(cameras[name].lens_covariance)) for name in names
+                    if name in used}, tuple(pairs))
+
+
+def _pair(cameras: Mapping[str, CameraPaths], places: Mapping[str, Place], reference: SceneKey,
+          other: SceneKey) -> Pair | None:
+    its, own = (cameras[key[0]].scenes[key[1]] for key in (reference, other))
+    place = places[other[0]]
+    when = places[reference[0]].on_own(place.on_base(own.seconds))
+    rows = np.flatnonzero(its.within(when))
+    if len(rows) < LEAST_SHARED:
+        return None
+    rotations, translations, _ = its.trajectory.at(when[rows])
+    centres = -np.einsum('nji,nj->ni', rotations, translations)
+    across = place.rotation @ places[reference[0]].rotation.T
+    turned = np.sum((across @ rotations).transpose(0, 2, 1)
+                    @ own.trajectory.rotations[rows], axis=0)
+    u, _, v = np.linalg.svd(turned)
+    gauge = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ v))]) @ v
+    theirs = own.centres[rows] @ gauge.T
+    scale = _length(centres) / max(_length(theirs), 1e-12)
+    return Pair(reference, other, rows,
+                Gauge(gauge, np.mean(centres - scale * theirs, axis=0), float(np.log(scale))))
+
+
+def _length(centres: Floats) -> float:
+    return float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum())
+
+
+def _unit_of(scene: ScenePath, speed: Metres | None) -> tuple[float, float]:
+    """Return the log of the metres in a scene's unit, and its sigma."""
+    ways, between = np.linalg.norm(np.diff(scene.centres, axis=0), axis=1), np.diff(scene.seconds)
+    if speed is not None:
+        metres = speed(scene.seconds[:-1] + between / 2) * between
+        bend = np.linalg.norm(scene.turned(scene.seconds), axis=1) / np.maximum(ways, 1e-12)
+        kept = (bend < UNBENT * bend.max()) & (metres > 0)
+        sigma = SPEED_SIGMA if kept.sum() >= LEAST_SHARED else BENT_SIGMA
+        kept = kept if kept.sum() >= LEAST_SHARED else metres > 0
+        if kept.any():
+            return float(np.log(metres[kept].sum() / ways[kept].sum())), sigma
+    return float(np.log(USUAL_SPEED * between.sum() / max(ways.sum(), 1e-12))), UNKNOWN_UNIT

@@ -1,0 +1,354 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recorded drives of several cameras of one car in, a rig out.
+
+Each camera is calibrated alone. Then the stretches that cameras share are read once more, with the
+lenses known: for the pose of every image, and for matches between cameras that see the same.
+"""
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from dashcalib_ros.arrays import Floats, Mask
+from dashcalib_ros.camera import Camera
+from dashcalib_ros.config import Config
+from dashcalib_ros.errors import InputError, Notice
+from dashcalib_ros.input import Frame
+from dashcalib_ros.input.inputs import Paths
+from dashcalib_ros.input.motion import speeds_of
+from dashcalib_ros.input.scale import Scale
+from dashcalib_ros.pipeline import Calibrator
+from dashcalib_ros.reconstruct.scene import Scene
+from dashcalib_ros.report import Calibration
+from dashcalib_ros.rig.dense import retraced
+from dashcalib_ros.rig.joint import Solved, solved
+from dashcalib_ros.rig.paths import CameraPaths, camera_paths, coarse_paths, ordered
+from dashcalib_ros.rig.placed import (
+    PlacedCamera,
+    RigCalibration,
+    base_camera,
+    not_placed,
+    placed,
+    why_not_aligned,
+)
+from dashcalib_ros.rig.start import Aligned, Metres, aligned, problem_of
+from dashcalib_ros.rig.witness import (
+    Epipolar,
+    fitted,
+    matched,
+    rays_of,
+    residual_over,
+    sees_alike,
+)
+from dashcalib_ros.session import (
+    MotionOrPath,
+    Observer,
+    Recording,
+    Settings,
+    _learned,
+    _Progress,
+    _settings,
+    open_drive,
+    with_source,
+)
+from dashcalib_ros.solve.solution import Solution
+from dashcalib_ros.workers.child import ChildWorker
+from dashcalib_ros.workers.pool import ScenePool
+from dashcalib_ros.workers.worker import Progress
+
+# s between the images of a stretch whose poses are found: those of all cameras nearest to the
+# same times are taken
+GRID_S = 0.1
+# pairs of images in which two cameras are matched, and s that these may be apart
+PICTURES, TOGETHER_S = 12, 0.012
+# sigmas of a rotation, and degrees, that the epipolar geometry of matches may be off
+CONTRADICTED, LEAST_APART_DEG = 3.0, 0.15
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What one camera's drive gave. valid: where the ego vehicle is not, as resized."""
+
+    drive: Recording
+    calibration: Calibration
+    solution: Solution | None
+    scale: Scale
+    valid: Mask | None
+
+    @property
+    def start_s(self) -> float:
+        """Return the stamp of the first image."""
+        return self.calibration.start_s
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A rig, and the calibration of each of its cameras."""
+
+    rig: RigCalibration
+    calibrations: Mapping[str, Calibration]
+
+
+class _Named(Observer):
+    """Shows the stages of one of several cameras."""
+
+    def __init__(self, inner: Observer, name: str) -> None:
+        self._inner, self._name = inner, name
+
+    def show(self, stage: str, share: float | None = None, note: str = '') -> None:
+        self._inner.show(f'{self._name}: {stage}', share, note)
+
+
+def rig_of_drives(drives: Mapping[str, Recording], base: str | None = None,
+                  config: Config | None = None, observer: Observer | None = None,
+                  place: Callable[[str], str] = lambda name: f'{name}/result.json') -> Rig:
+    """Calibrate the cameras of one car, and where each sits.
+
+    drives: by the cameras' names. base: the name of the camera that the others are placed
+    against; None: the first. place: of a camera's result, for the file. Raises InputError.
+    """
+    config, observer = config or Config(), observer or Observer()
+    base = base or next(iter(drives))
+    if base not in drives or len(drives) < 2:
+        raise InputError('E-RIG-CAMERAS', f'a rig needs two cameras, and its base, {base}, is one '
+                         f'of them: name them as front=front.mp4 left=left.mp4')
+    learned = {name: _learn(name, drive, config, observer) for name, drive in drives.items()}
+    found = {name: coarse_paths(name, each.solution, each.start_s)
+             for name, each in learned.items()}
+    turned = {name: aligned(found[name], found[base], _clock(learned, name, base))
+              for name in drives if name != base}
+    kept = {name: each for name, each in turned.items() if each is not None and each.found}
+    observer.show('retracing the stretches that cameras share', None)
+    again = _Again(learned, base, found, kept, config)
+    again.read()
+    with _workers(config, observer) as pool:
+        paths = again.paths(pool, observer)
+        matches = again.matches(pool)
+    observer.show('placing the cameras', None)
+    problem = problem_of(paths, base, kept, _metres(learned, base))
+    best = solved(problem) if problem.pairs else None
+    calibrations = {name: each.calibration for name, each in learned.items()}
+    levels = {name: each.calibration.verdict.level for name, each in learned.items()}
+    metric = _metres(learned, base) is not None
+    cameras: dict[str, PlacedCamera] = {}
+    witness: Mapping[tuple[str, str], Epipolar] = {}
+    if best is not None:
+        witness, doubts = _witnessed(learned, best, matches)
+    for name in drives:
+        if name == base:
+            cameras[name] = base_camera(place(name), levels[name])
+        elif best is None or name not in best.problem.places:
+            cameras[name] = not_placed(place(name), why_not_aligned(
+                name, base, turned[name], len(found[name].scenes)))
+        else:
+            cameras[name] = placed(
+                name, place(name), levels[name], best, metric,
+                learned[name].start_s - learned[base].start_s, config.rig, doubts.get(name, ()))
+    return Rig(RigCalibration(base, cameras, witness), calibrations)
+
+
+def _learn(name: str, drive: Recording, config: Config, observer: Observer) -> Learned:
+    named = _Named(observer, name)
+    try:
+        with _learned(drive, config, named, False) as calibrator:
+            calibration = with_source(calibrator.calibrate(named.show), drive.source)
+            return _kept(drive, calibration, calibrator)
+    except InputError as error:
+        raise InputError(error.code, f'{name}: {error}') from error
+
+
+def _kept(drive: Recording, calibration: Calibration, calibrator: Calibrator) -> Learned:
+    return Learned(drive, calibration, calibrator.solution, calibrator.detection.scale,
+                   calibrator.detection.valid())
+
+
+def _clock(learned: Mapping[str, Learned], name: str, base: str) -> float:
+    """Return how late a camera's stamps are if both have one clock, from their first images."""
+    return learned[base].start_s - learned[name].start_s
+
+
+@contextmanager
+def _workers(config: Config, observer: Observer) -> Iterator[ScenePool]:
+    pool = ScenePool(config, lambda: ChildWorker(False, False, config.threads, lambda text: None),
+                     _load)
+    pool.start()
+    try:
+        yield pool
+    finally:
+        with observer.closing():
+            pool.close()
+
+
+def _load() -> None:
+    import dashcalib_ros.rig.dense  # noqa: F401
+
+
+class _Again:
+    """The second reading of the drives: the images of stretches that are shared."""
+
+    def __init__(self, learned: Mapping[str, Learned], base: str,
+                 found: Mapping[str, CameraPaths], kept: Mapping[str, Aligned],
+                 config: Config) -> None:
+        self._learned, self._base, self._config = learned, base, config
+        self._late = {base: 0.0} | {name: each.late_s for name, each in kept.items()}
+        self._rotations = {base: np.eye(3)} | {
+            name: each.rotation for name, each in kept.items()}
+        spans = {name: [(scene.seconds[0] - late, scene.seconds[-1] - late)
+                        for scene in found[name].scenes] for name, late in self._late.items()}
+        others = {name: [span for other in spans if other != name
+                         and self._base in (name, other) for span in spans[other]]
+                  for name in spans}
+        # the stretches of each camera that another one saw, too, and their images
+        self._shared = {name: [n for n, own in enumerate(spans[name]) if any(
+            min(own[1], other[1]) - max(own[0], other[0]) > 0.5 for other in others[name])]
+            for name in spans}
+        self._spans = spans
+        self._frames: dict[tuple[str, int], dict[int, Frame]] = defaultdict(dict)
+
+    def read(self) -> None:
+        """Read the drives."""
+        for name, late in self._late.items():
+            each = self._learned[name]
+            wanted = {n: self._spans[name][n] for n in self._shared[name]}
+            last = max((end for _, end in wanted.values()), default=-np.inf)
+            if not wanted:
+                continue
+            for frame in each.drive.source:
+                seconds = frame.stamp_ns / 1e9 - each.start_s - late
+                if seconds > last + GRID_S:
+                    break
+                key, small = round(seconds / GRID_S), None
+                for n, (begin, end) in wanted.items():
+                    if begin - 1e-6 <= seconds <= end + 1e-6:
+                        before = self._frames[name, n].get(key)
+                        if before is None or abs(seconds - key * GRID_S) < abs(
+                                self._seconds(name, before) - key * GRID_S):
+                            small = small or each.scale.frame(frame)
+                            self._frames[name, n][key] = small
+
+    def _seconds(self, name: str, frame: Frame) -> float:
+        each = self._learned[name]
+        return float(frame.stamp_ns / 1e9 - each.start_s - self._late[name])
+
+    def paths(self, pool: ScenePool, observer: Observer) -> dict[str, CameraPaths]:
+        """Return the paths of the cameras, with the pose of every image."""
+        calls = {}
+        for (name, n), frames in self._frames.items():
+            each = self._learned[name]
+            assert each.solution is not None
+            scene = ordered(each.solution)[n]
+            calls[name, n] = pool.begin(
+                retraced, list(frames.values()), scene, each.solution, self._config, each.valid)
+        scenes: dict[str, list[Scene]] = {name: [] for name in self._late}
+        for number, ((name, _), call) in enumerate(calls.items()):
+            observer.show('retracing the stretches that cameras share', number / len(calls))
+            scene = pool.result(call)
+            if scene is not None:
+                scenes[name].append(scene)
+        found = {}
+        for name, theirs in scenes.items():
+            each = self._learned[name]
+            if each.solution is not None:
+                found[name] = camera_paths(name, each.solution, theirs, each.start_s)
+        return found
+
+    def matches(self, pool: ScenePool) -> dict[tuple[str, str], list[tuple[Floats, Floats]]]:
+        """Return the matches of cameras that see alike, at equal times."""
+        images: dict[str, dict[int, Frame]] = defaultdict(dict)
+        for (name, _), frames in self._frames.items():
+            images[name] |= frames
+        calls = {}
+        for a, b in combinations(images, 2):
+            cameras = [self._learned[name].solution for name in (a, b)]
+            across = self._rotations[b] @ self._rotations[a].T
+            if any(each is None for each in cameras) or not sees_alike(
+                    cameras[0].camera, cameras[1].camera, across):  # type: ignore[union-attr]
+                continue
+            both = [key for key in sorted(images[a].keys() & images[b].keys()) if abs(
+                self._seconds(a, images[a][key]) - self._seconds(b, images[b][key])) < TOGETHER_S]
+            some = sorted({both[int(n)] for n in np.linspace(0, len(both) - 1, PICTURES)}
+                          if both else set())
+            calls[a, b] = [pool.begin(matched, images[a][key].image, images[b][key].image)
+                           for key in some]
+        return {pair: [pool.result(call) for call in each] for pair, each in calls.items()}
+
+
+def _witnessed(learned: Mapping[str, Learned], best: Solved,
+               matches: Mapping[tuple[str, str], Sequence[tuple[Floats, Floats]]]
+               ) -> tuple[dict[tuple[str, str], Epipolar], dict[str, tuple[Notice, ...]]]:
+    """Return the epipolar residuals, and what contradicts a camera's rotation."""
+    found: dict[tuple[str, str], Epipolar] = {}
+    doubts: dict[str, tuple[Notice, ...]] = {}
+    for (a, b), pairs in matches.items():
+        if not pairs or not {a, b} <= best.problem.places.keys():
+            continue
+        cameras = [_refined(learned[name], best, name) for name in (a, b)]
+        rays, xy = rays_of(cameras, pairs, [learned[name].solution.field  # type: ignore[union-attr]
+                                            for name in (a, b)])
+        across = best.problem.places[b].rotation @ best.problem.places[a].rotation.T
+        scale = learned[a].scale.px
+        held = fitted(rays, across, cameras[0].fx)
+        if held is None:
+            continue
+        seen = residual_over(cameras[0], xy, held)
+        found[a, b] = replace(seen, median=seen.median * scale, cells_rms=seen.cells_rms * scale)
+    return found, doubts
+
+
+def _refined(each: Learned, best: Solved, name: str) -> Camera:
+    """Return a camera's lens as the rig has it."""
+    assert each.solution is not None
+    wide = each.solution.camera.widened()
+    return wide.with_params(wide.params + best.problem.lenses[name][:-1])
+
+
+def _metres(learned: Mapping[str, Learned], base: str) -> Metres | None:
+    """Return how far the car goes, where any of the drives has a speed."""
+    each = learned[base]
+    if each.drive.motion is None:
+        return None
+    speed = speeds_of(each.drive.motion.since(each.start_s))
+    if speed is None:
+        return None
+    return lambda seconds: speed.at(seconds)[:, 0]
+
+
+# for Python ---------------------------------------------------------------------------------
+
+
+def calibrate_rig(drives: Mapping[str, Paths | Recording], base: str | None = None,
+                  fps: float | None = None, config: Settings = None,
+                  motion: MotionOrPath = None, progress: Progress | None = None) -> Rig:
+    """Calibrate several cameras of one car from one drive, and where each sits.
+
+    drives: by the cameras' names: a video, a bag, a folder of images, as for calibrate();
+    PATH:TOPIC for one topic of a bag. Every camera may have its own size, rate, lens, shutter and
+    clock. base: the camera that the others are placed against; None: the first. fps, config: as
+    for calibrate(). motion: data of the car's sensors, on the clock of the base: with a speed
+    translations are in metres. progress: as for calibrate().
+
+    Returns a Rig: its rig has a PlacedCamera for each name, with a verdict for each degree of
+    freedom, and its calibrations those of the cameras alone. Raises as calibrate() does.
+    """
+    settings = _settings(config, None)
+    base = base or next(iter(drives), '')
+    opened = {name: path if isinstance(path, Recording) else open_camera(
+        path, fps, motion if name == base else None) for name, path in drives.items()}
+    with _Progress(progress) as observer:
+        return rig_of_drives(opened, base, settings, observer)
+
+
+def open_camera(path: Paths, fps: float | None = None, motion: MotionOrPath = None) -> Recording:
+    """Open one camera's drive. path: also PATH:TOPIC."""
+    topic = None
+    if isinstance(path, str) and not Path(path).exists() and ':' in path:
+        before, _, after = path.rpartition(':')
+        if Path(before).exists():
+            path, topic = before, after
+    return open_drive(path, topic, fps, motion=motion)
