@@ -2,14 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Accuracy, honesty and refusals, measured on rendered drives with exact truth and on real ones.
 
-    python benchmark/accuracy.py [SETTING ...] [--seeds 0 1 2] [--data DIR] [--cache DIR]
+    python benchmark/accuracy.py [--drives SETTING ...] [--seeds 0 1 2] [--data DIR] [--cache DIR]
                                  [--out DIR] [--results] [--again] [--list] [--summary]
                                  [--solved]
 
 Runs every setting (or those named; part of a name will do) with every seed. Rows go to
 DIR/accuracy.json after each drive, and one that is there is not run again (--again: it is);
-DIR/accuracy.md has each drive, each setting, the bars and honesty; --results writes the settings'
-table into benchmark/results/accuracy.md. --data: a folder with kitti03/,
+DIR/accuracy.md has each setting, the bars and honesty; --results writes the same into
+benchmark/results/accuracy.md. --data: a folder with kitti03/,
 carnd/ and ntu_campus/ (bag, video or images beside a truth.json); kitti03 is seen through other
 lenses, too (views.py). --cache: where rendered pictures are kept, about 100 MB a drive; a second
 run renders nothing.
@@ -17,7 +17,6 @@ run renders nothing.
 from __future__ import annotations
 
 import json
-import os
 import tempfile
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -34,6 +33,7 @@ from measure import (
     done,
     error_cells,
     isolated,
+    keep_table,
     load,
     mapping_cell,
     parser_with,
@@ -41,9 +41,8 @@ from measure import (
     summarised,
     table,
 )
-from result_tables import write_table
 from solutions import solution_path, solved_drive
-from summary import settings_table, summary
+from summary import summary
 from views import BY_VIEW, INEXACT, SMALL, Viewed, inexact_view, recorded_view, small_view
 from wide import WIDE, wide_drive_of
 
@@ -174,8 +173,7 @@ def _real(name: str) -> bool:
 
 def main() -> None:
     """Run what is asked for."""
-    parser = parser_with(__doc__, 'seeds', 'data', 'cache', 'out', 'results', 'again')
-    parser.add_argument('settings', nargs='*', help='default: all')
+    parser = parser_with(__doc__, 'seeds', 'drives', 'data', 'cache', 'again')
     parser.add_argument('--list', action='store_true', help='name the settings, and end')
     parser.add_argument('--solved', action='store_true',
                         help='take the solutions that check.py has in the cache, and run nothing')
@@ -189,7 +187,7 @@ def main() -> None:
     path = arguments.out / 'accuracy.json'
     rows = load(path)
     if not arguments.summary:
-        names = _chosen(arguments.settings, arguments.data)
+        names = _chosen(arguments.drives or [], arguments.data)
         # one seed of everything before the next seed: an interrupted run covers all settings
         jobs = [(name, seed) for seed in arguments.seeds for name in names
                 if seed == arguments.seeds[0] or not _real(name)]
@@ -215,12 +213,7 @@ def main() -> None:
                 if not arguments.cache:
                     _forget(Path(passing) / str(number))
     save(path, rows)
-    text = f'{drives_table(_ordered(rows))}\n\n{summary(rows.values())}\n'
-    (arguments.out / 'accuracy.md').write_text(
-        f'Measured on {os.cpu_count()} cores at {", ".join(_commits(rows))}.\n\n{text}')
-    if arguments.results:
-        write_table('accuracy', settings_table(_ordered(rows)), _commits(rows))
-    print(f'\n{text}')
+    keep_table('accuracy', summary(_ordered(rows)), arguments, _commits(rows))
 
 
 def _ordered(rows: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]:

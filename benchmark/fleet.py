@@ -3,7 +3,7 @@
 """What `dashcalib batch` must show; one command for all of it, or for a part.
 
     python benchmark/fleet.py [lost] [clips] [prior] [speed] [real] [--videos N]
-                              [--seeds N ...] [--data DIR] [--cache DIR] [--out DIR]
+                              [--seeds N ...] [--data DIR] [--cache DIR] [--out DIR] [--results]
 
 lost: 200 clips of 20 cameras on two Ray nodes; one node is killed, then the driver; are the tables
 those of one process, byte for byte? clips: five one-turn clips against the drive they were cut
@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 from fleet_clips import bends, cuts, fleet, street, unit_of, write_clip
-from measure import commit, load, parser_with, save, table
+from measure import commit, keep_table, load, parser_with, save, table
 from real import DRIVES
 
 from dashcalib_ros.config import Config
@@ -294,11 +294,10 @@ PARTS = {'lost': lost, 'clips': clips, 'prior': prior, 'speed': speed, 'real': r
 
 def main() -> None:
     """Measure what is asked for."""
-    parser = parser_with(__doc__, 'data', 'cache', 'out')
+    parser = parser_with(__doc__, 'data', 'cache', 'seeds', 'again', seeds=SEEDS)
     parser.add_argument('parts', nargs='*', metavar='PART', help=f'of {", ".join(PARTS)}')
     parser.add_argument('--videos', type=int, default=4,
                         help='cameras with videos, in `lost` and `speed`')
-    parser.add_argument('--seeds', nargs='+', type=int, default=SEEDS, help='of `prior`')
     arguments = parser.parse_args()
     if unknown := set(arguments.parts) - set(PARTS):
         parser.error(f'there is no part {", ".join(sorted(unknown))}; choose of '
@@ -311,10 +310,12 @@ def main() -> None:
         asked = Asked(arguments.videos, arguments.seeds, arguments.cache or Path(passing),
                       arguments.data)
         for part in arguments.parts or PARTS:
-            found |= {part: PARTS[part](arguments.out / 'fleet', asked), 'commit': commit(),
-                      'cores': os.cpu_count()}
+            if part in found and not arguments.again:
+                continue
+            found |= {part: PARTS[part](arguments.out / 'fleet', asked),
+                      'commits': {**found.get('commits', {}), part: commit()}}
             save(path, found)
-    print(report(found))
+    keep_table('fleet', report(found), arguments, found['commits'].values())
 
 
 if __name__ == '__main__':

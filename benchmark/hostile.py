@@ -5,8 +5,8 @@
     python benchmark/hostile.py [ATTACK ...] [--quick] [--out DIR] [--results] [--again] [--list]
 
 Each attack is tried many times, each try in its own way. A line goes to DIR/hostile.jsonl after
-each try, and one that is there is not tried again; DIR/hostile.md counts them. All of it takes
-half an hour, and --quick two minutes; ROS is needed.
+each try, and one that is there is not tried again; DIR/hostile.md counts them, also those that
+were never tried. All of it takes half an hour, and --quick two minutes; ROS is needed.
 """
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ import rclpy
 import with_tests  # noqa: F401
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
-from measure import commit, parser_with, table
+from measure import commit, keep_table, parser_with, table
 from processes import processes_of
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import (
@@ -45,7 +45,6 @@ from rcl_interfaces.srv import (
     SetParameters,
     SetParametersAtomically,
 )
-from result_tables import write_table
 from ros_bench import (
     CAMERA_FILE,
     COMMAND,
@@ -1118,19 +1117,21 @@ def tried(attack: Attack, lacking: Sequence[int]) -> Iterator[tuple[int, str]]:
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> str:
-    """Return a line for each attack."""
+    """Return a line for each attack, also where it was not tried."""
     lines = []
     for attack in ATTACKS:
         own = [row for row in rows if row['attack'] == attack.name]
         bad = [row for row in own if row['said']]
-        if own:
-            lines.append([attack.name, f'{len(own) - len(bad)} of {len(own)}', ' '.join(
-                f'try {bad[0]["try"]}: {bad[0]["said"]}'.split())[:200] if bad else ''])
-    return table(['attack', 'held', 'the first that did not'], lines)
+        lines.append([attack.name, f'{len(own) - len(bad)} of {len(own)}' if own else 'not tried',
+                      ' '.join(f'try {bad[0]["try"]}: {bad[0]["said"]}'.split())[:200]
+                      if bad else ''])
+    held = sum(cells[1] != 'not tried' and not cells[2] for cells in lines)
+    return f'{held} of {len(lines)} attacks held.\n\n' + table(
+        ['attack', 'held', 'the first that did not'], lines)
 
 
 def main() -> None:
-    parser = parser_with(__doc__ or '', 'out', 'results', 'again')
+    parser = parser_with(__doc__, 'again')
     parser.add_argument('attacks', nargs='*', help='parts of names; default: all')
     parser.add_argument('--quick', action='store_true', help='a few tries of each')
     parser.add_argument('--list', action='store_true', help='name the attacks, and end')
@@ -1161,11 +1162,8 @@ def main() -> None:
                 if said:
                     print(f'{attack.name}, try {n}: {said}', file=sys.stderr, flush=True)
             print(f'{attack.name}: {count}', flush=True)
-    text = summary(list(rows.values()))
-    (options.out / 'hostile.md').write_text(text + '\n')
-    if options.results:
-        write_table('hostile', text, {row['commit'] for row in rows.values()})
-    print(text)
+    keep_table('hostile', summary(list(rows.values())), options,
+               [row['commit'] for row in rows.values()])
 
 
 if __name__ == '__main__':

@@ -36,8 +36,17 @@ from drives import (
     pictures_of,
 )
 from hill import OnRoad, RoadSpec
-from measure import commit, complain, done, isolated, load, parser_with, save, table
-from result_tables import write_table
+from measure import (
+    commit,
+    complain,
+    done,
+    isolated,
+    keep_table,
+    load,
+    parser_with,
+    save,
+    table,
+)
 
 from dashcalib_ros import Calibrator, Config, open_frames
 from dashcalib_ros.arrays import Floats, plain_values
@@ -143,8 +152,7 @@ def summary(rows: Mapping[str, Mapping[str, Any]]) -> str:
 
 def main() -> None:
     """Measure."""
-    arguments = parser_with(__doc__, 'data', 'cache', 'seeds', 'out', 'results',
-                            'again').parse_args()
+    arguments = parser_with(__doc__, 'data', 'cache', 'seeds', 'again').parse_args()
     path = arguments.out / 'mount.json'
     rows = load(path)
 
@@ -178,10 +186,7 @@ def main() -> None:
                 times = np.arange(0.0, drive.times[-1], 0.01)
                 speed = speed_of(times, drive.ride.camera_at(times + MARGIN_S)[1])
                 keep(name, isolated(found, rendered, Config(seed=seed), speed), True, truth)
-    text = summary(rows)
-    print(text)
-    if arguments.results:
-        write_table('mount', text, [row['commit'] for row in rows.values()])
+    keep_table('mount', summary(rows), arguments, [row['commit'] for row in rows.values()])
 
 
 if __name__ == '__main__':

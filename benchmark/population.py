@@ -2,17 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Random dashcams: lens, shutter, glass, picture and drive of each are drawn from a seed.
 
-    python benchmark/population.py --seeds 1000-1059 --out DIR [--workers N]
-                                   [--stage scenes|all] [--again] [--summary]
+    python benchmark/population.py [--seeds 1000-1059] [--out DIR] [--workers N]
+                                   [--stage scenes|all] [--results] [--again] [--summary]
                                    [--engine colmap|opencv]
 
-DIR/SEED.scenes.pkl has what `solve` gets: the reconstructed turns, and the truth (dashcams.py).
-DIR/SEED.json has what the result is off by. What is there is not made again; --again: results are,
-from the same scenes. The tables are printed, and written to DIR/population.md.
+DIR/population_ENGINE/SEED.scenes.pkl has what `solve` gets: the reconstructed turns, and the truth
+(dashcams.py). SEED.json has what the result is off by. What is there is not made again; --again:
+results are, from the same scenes. The tables are printed, and written to DIR/population.md. No
+seed may be looked at before its run.
 """
 from __future__ import annotations
 
-import argparse
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -34,7 +34,9 @@ from measure import (
     done,
     errors,
     isolated,
+    keep_table,
     load,
+    parser_with,
     processor_s,
     save,
     table,
@@ -321,37 +323,29 @@ def _write_case(seed: int, config: Config, path: Path) -> str:
     return f'{len(case.scenes)} scenes of {len(case.spec.turn_list)} turns, {case.cpu_s:.0f} CPU s'
 
 
-def _seeds(text: str) -> range:
-    first, _, last = text.partition('-')
-    return range(int(first), int(last or first) + 1)
-
-
 def main() -> None:
     """Measure."""
     # processes that start from here inherit it: an inline calibrator needs one thread, and what
     # COLMAP and Ceres warn of is not shown by a calibrator's children either
     os.environ.update({**dict.fromkeys(THREAD_VARIABLES, '1'), 'GLOG_minloglevel': '2'})
-    parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n')[0])
-    parser.add_argument('--seeds', type=_seeds, required=True, help='a seed, or the first-last')
-    parser.add_argument('--out', type=Path, required=True)
+    parser = parser_with(__doc__, 'seeds', 'again', seeds=range(4000, 4030))
     parser.add_argument('--workers', type=int, default=1, help='drives at a time')
     parser.add_argument('--stage', choices=('scenes', 'all'), default='all')
-    parser.add_argument('--again', action='store_true', help='results that are there, too')
     parser.add_argument('--summary', action='store_true', help='of the results there are, and end')
     parser.add_argument('--engine', choices=(COLMAP, OPENCV), default=Config().reconstruct.engine,
                         help='what estimates the poses of turns')
     given = parser.parse_args()
     config = Config().replace({'reconstruct.engine': given.engine})
-    given.out.mkdir(parents=True, exist_ok=True)
+    folder = given.out / f'population_{given.engine}'
+    folder.mkdir(parents=True, exist_ok=True)
     if not given.summary:
         with ThreadPoolExecutor(given.workers) as pool:
-            list(pool.map(lambda seed: run(seed, given.out, given.stage, given.again, config),
+            list(pool.map(lambda seed: run(seed, folder, given.stage, given.again, config),
                           given.seeds))
-    rows = [row for seed in given.seeds if (row := load(given.out / f'{seed}.json'))]
+    rows = [row for seed in given.seeds if (row := load(folder / f'{seed}.json'))]
     if rows:
-        text = summary(rows)
-        print(text)
-        (given.out / 'population.md').write_text(text + '\n')
+        keep_table('population', f'Engine: {given.engine}.\n\n{summary(rows)}', given,
+                   [row['commit'] for row in rows if 'commit' in row])
 
 
 if __name__ == '__main__':

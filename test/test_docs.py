@@ -66,15 +66,6 @@ def test_the_newest_changes_are_on_top_with_their_date():
                for each in headings[1:])
 
 
-def test_each_figure_of_the_readme_names_its_commit():
-    figures = (ROOT / 'README.md').read_text().partition('\n## Figures')[2].partition('\n## ')[0]
-    rows = [line for line in figures.splitlines() if line.startswith('| ')][1:]
-    assert rows
-    for row in rows:
-        assert re.search(r'\| \[[0-9a-f]{7}(, [0-9a-f]{7})*\]'
-                         r'\((docs|benchmark/results)/\w+\.md[^)]*\) \|$', row), row
-
-
 def test_the_commits_of_figures_are_in_the_history():
     shallow = subprocess.run(['git', 'rev-parse', '--is-shallow-repository'], cwd=ROOT,
                              capture_output=True, text=True)

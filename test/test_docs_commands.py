@@ -60,6 +60,7 @@ CANNOT_RUN = {
     'jupyter execute': 'takes a minute, and writes into examples/',
     'python examples/play.py': 'test/ros/test_play.py plays a video to a node',
     'python benchmark/': 'takes minutes to hours: test_benchmark.py starts each with --help',
+    'python -m benchmark': 'takes up to a day: test_benchmark.py runs a part that is made up',
     'benchmark/': 'takes half an hour: it emulates another processor',
     'dashcalib batch s3://': 'needs a bucket and a cluster: test/fleet has both in memory',
     'dashcalib demo': 'takes a minute: test/cli/test_run.py runs it with two turns',
