@@ -29,7 +29,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import with_tests  # noqa: F401
 from drives import pictures_of
 from measure import commit, keep_table, load, parser_with, save, table
 from real import DRIVES

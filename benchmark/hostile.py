@@ -32,7 +32,6 @@ from typing import Any
 import cv2
 import numpy as np
 import rclpy
-import with_tests  # noqa: F401
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from measure import commit, keep_table, parser_with, table
@@ -379,19 +378,32 @@ def calibration_files(folder: Path, tries: Sequence[int]) -> Iterator[None]:
         yield
 
 
+def spoil(path: Path, n: int) -> None:
+    """Damage a file of arrays: cut it off, or replace it. test/store has what is wrong inside."""
+    whole = path.read_bytes()
+    path.write_bytes((whole[:n * len(whole) // 100], os.urandom(5000), b'')[n % 3])
+    if n % 10 == 9:
+        np.savez(path, weights=np.zeros(n))
+
+
 def stores(folder: Path, tries: Sequence[int]) -> Iterator[None]:
     """A damaged turn costs one warning, and the others stay."""
-    from test_turn_store import CAMERA, SPOILED, hold, stored
+    from fleet_made import YAWS, clip_of
 
+    from dashcalib_ros.detect import TurnId
+    from dashcalib_ros.input.scale import Scale
+    from dashcalib_ros.store.scene_file import Origin
     from dashcalib_ros.store.turn_store import TurnStore
+    origin = Origin((800, 450), Scale(), 'camera')
+    turns = clip_of(yaws=YAWS[:2], tracks=60, keyframes=8).turns
     for n in tries:
         said: list[str] = []
         store = TurnStore(str(folder / str(n)), 10, 3.0, said.append)
-        store.load(CAMERA)
-        hold(store, stored(0), stored(1))
-        list(SPOILED.values())[n % len(SPOILED)](sorted((folder / str(n)).iterdir())[0])
+        store.load(origin)
+        store.mirror({TurnId.at(100 + k): turn for k, turn in enumerate(turns)})
+        spoil(sorted((folder / str(n)).iterdir())[0], n)
         again = TurnStore(str(folder / str(n)), 10, 3.0, said.append)
-        again.load(CAMERA)
+        again.load(origin)
         assert len(again.turns) == 1 and len(said) == 1, said
         yield
 
@@ -590,19 +602,12 @@ def pipes(folder: Path, tries: Sequence[int]) -> Iterator[None]:
 def scene_files(folder: Path, tries: Sequence[int]) -> Iterator[None]:
     """A damaged clip of scenes costs its own row; nothing is written beside the output."""
     from fleet_made import YAWS, clip_of, lens_of, written
-    from test_scene_file import ABOUTS, ARRAYS, damaged
-    from test_turn_store import SPOILED
-    contents = [damaged(about=about) for about in ABOUTS]
-    contents += [damaged(**{f'turn0.{name}': value for name, value in each.items()})
-                 for each in ARRAYS]
-    ways = [*SPOILED.values(), *(lambda path, data=data: path.write_bytes(data)
-                                 for data in contents)]
     for n in tries:
         place = folder / str(n)
         for m in range(2):
             written(clip_of(lens_of(), YAWS[m:m + 1], world=m, tracks=60, keyframes=7),
                     place / f'{m}.npz')
-        ways[n % len(ways)](place / '1.npz')
+        spoil(place / '1.npz', n)
         (place / 'm.csv').write_text('clip,camera\n0.npz,one\n1.npz,one\n')
         before = {path.name for path in place.iterdir()}
         done = subprocess.run(
@@ -1089,7 +1094,7 @@ ATTACKS = [
     Attack('SIGKILL of children that calibrate', 10, 1, child_kills),
     Attack('Ctrl-C at any line', 100, 4, interrupts),
     Attack('a FIFO for a file', 11, 11, pipes),
-    Attack('clips of scenes', 88, 6, scene_files),
+    Attack('clips of scenes', 40, 6, scene_files),
     Attack('two cameras on one stream', 26, 4, two_cameras),
     Attack('two publishers', 20, 3, two_publishers),
     Attack('pictures that take long', 20, 5, slow_pictures),

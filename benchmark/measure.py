@@ -18,6 +18,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+# what tests and benchmarks share; who imports of it imports this module before
+sys.path.append(str(Path(__file__).resolve().parents[1] / 'testing'))
 from mapping import is_fisheye, mapping_error, model_of
 from result_tables import commit as commit
 from result_tables import keep_table as keep_table

@@ -15,12 +15,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import with_tests  # noqa: F401
 from drives import pictures_of
-from made_motion import town
 from measure import complain, keep_table, parser_with, table
 from scipy.spatial.transform import Rotation, RotationSpline
 from solving import with_camera
+from towns import town
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.config import Config

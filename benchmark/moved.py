@@ -14,11 +14,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import with_tests  # noqa: F401
 from measure import keep_table, parser_with, table
 from solving import scenes_of, solved, with_camera
+from straight_pairs import SPACING_S, SPEED, mounted, pairs_of
 from synthetic import LENS
-from test_mount import SPACING_S, SPEED, mounted, pairs_of
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.detect.straights import Straights

@@ -23,7 +23,6 @@ from typing import Any
 import cv2
 import numpy as np
 import rclpy
-import with_tests  # noqa: F401
 from measure import keep_table, parser_with, table, unit_s
 from ros_bench import Bench, NodeProcess, image_message, ros_environment
 from sensor_msgs.msg import Image

@@ -24,7 +24,6 @@ from typing import Any
 
 import numpy as np
 import rclpy
-import with_tests  # noqa: F401
 from measure import keep_table, parser_with, unit_s
 from ros_bench import LARGE_IMAGES, Bench, NodeProcess, image_message, ros_environment
 from sensor_msgs.msg import CompressedImage

@@ -31,7 +31,6 @@ from typing import Any
 import cv2
 import numpy as np
 import rclpy
-import with_tests  # noqa: F401
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from measure import keep_table, parser_with

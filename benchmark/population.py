@@ -6,9 +6,9 @@
                                    [--stage scenes|all] [--results] [--again] [--summary]
                                    [--engine colmap|opencv]
 
-DIR/population_ENGINE/SEED.scenes.pkl has what `solve` gets: the reconstructed turns, and the truth.
-SEED.json has what the result is off by. What is there is not made again; --again:
-results are, from the same scenes. The tables are printed, and written to DIR/population.md. No
+DIR/population_ENGINE/SEED.scenes.pkl has what `solve` gets: the reconstructed turns, and the
+truth. SEED.json has what the result is off by. What is there is not made again; --again: results
+are, from the same scenes. The tables are printed, and written to DIR/population.md. No
 seed may be looked at before its run.
 """
 from __future__ import annotations

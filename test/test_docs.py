@@ -56,7 +56,7 @@ def test_the_files_that_contributors_are_sent_to_exist():
     text = (ROOT / 'CONTRIBUTING.md').read_text()
     for name in re.findall(r'`([a-z_]+\.py)`', text):
         assert any(any((ROOT / folder).rglob(name))
-                   for folder in ('test', 'dashcalib_ros', 'benchmark')), name
+                   for folder in ('test', 'testing', 'dashcalib_ros', 'benchmark')), name
 
 
 def test_the_newest_changes_are_on_top_with_their_date():
