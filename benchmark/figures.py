@@ -256,7 +256,7 @@ FIGURES = (
            'mount', MOUNT),
     Figure(README, '| # of # images answered, # ms in the median, # % of a core | @ |',
            'node_latency', NODE),
-    Figure(README, 'KITTI 03 had fx # px live and # px by command and Python', 'node_drive', (
+    Figure(README, 'KITTI 03 had fx # px live and # px by command and Python (@)', 'node_drive', (
         found(r'fx (\d+\.\d ± \d+\.\d) px', r'\| fx \| (\d+\.\d)'),
         found(r'with other turns: (\d+\.\d ± \d+\.\d)', r'\| fx \| .*reference (\d+\.\d)'))),
     Figure(PROOF, '| # of #, # of #; #; # and # % | @ |', 'population', POPULATION),

@@ -26,9 +26,12 @@ from dashcalib_ros.solve.solution import Solution, cross_validation
 
 
 def solved_drives(cache: Path) -> list[Solved]:
-    """Return all drives in the cache."""
-    return [Solved(**pickle.loads(path.read_bytes()))
-            for path in sorted(solution_path('', 0, cache).parent.glob('*.pickle'))]
+    """Return all drives that this commit has solved; ends the script where there is none."""
+    found = [Solved(**pickle.loads(path.read_bytes()))
+             for path in sorted(solution_path('', 0, cache).parent.glob('*.pickle'))]
+    if not found:
+        raise SystemExit('no drive is solved at this commit: run check.py with this --cache')
+    return found
 
 
 def without(solution: Solution, number: int) -> Camera:
