@@ -5,6 +5,8 @@
     python benchmark/check.py [--drives NAME ...] [--seeds 0 1 2] [--data DIR] [--cache DIR]
         [--out DIR] [--results] [--again] [--solved]
 
+The drives are all rendered ones, and for monitor.py those of --data.
+
 Each drive is solved once (the cache keeps the solution), and then asked about its true camera,
 about that shifted by half a pixel, and about spoiled ones: fx 2 %, k1 0.03, cx 1 %, cy 2 % to
 either side, and pictures of another size. Rows go to DIR/check.json after each drive, tables to
@@ -142,15 +144,15 @@ def _median(values: Iterable[float | None]) -> str:
 
 def main() -> None:
     """Ask every drive."""
-    parser = parser_with(__doc__, 'seeds', 'drives', 'data', 'cache', 'again',
-                         drives=[*BY_NAME, *WIDE])
+    parser = parser_with(__doc__, 'seeds', 'drives', 'data', 'cache', 'again')
     parser.add_argument('--solved', action='store_true', help='only those that are solved already')
     arguments = parser.parse_args()
     cache = arguments.cache or Path('measured/cache')
+    names = arguments.drives or [*BY_NAME, *WIDE, *(RECORDED if arguments.data else ())]
     path = arguments.out / 'check.json'
     rows = load(path)
     for seed in arguments.seeds:
-        for name in arguments.drives:
+        for name in names:
             key = f'{name}, seed {seed}'
             if key in rows and not arguments.again:
                 continue

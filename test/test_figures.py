@@ -76,3 +76,37 @@ def test_figures_are_put_where_they_belong(tmp_path, monkeypatch):
                   Figure('page', 'fx # px', 'made', (cell('two', 'fx, px'),))):
         with pytest.raises(ValueError):
             wrong.with_figures(said)
+
+
+def test_what_scripts_write_is_read_as_what_was_copied_by_hand(tmp_path, monkeypatch):
+    """The places do not change when a table that was copied by hand is measured again."""
+    from fleet import report
+    from measure import table
+    from population import summary
+    monkeypatch.setattr(figures, 'RESULTS', tmp_path)
+    row = {'verdict': 'accepted', 'glass_px': 0.0, 'readout_ms': 10.0, 'truth_model': 'radial',
+           'rays_px': 0.31, 'camera_px': 0.4, 'sigma_px': 0.5, 'percent': {'fx': 0.1},
+           'error': {'fx': 0.6}, 'truth': {'fx': 600.0}, 'z': {'fx': 1.4, 'cx': 0.2},
+           'shutter_ms': 10.2, 'shutter_sigma_ms': 0.05, 'named': [], 'seed': 1, 'rate': 10.0,
+           'size': (640, 480), 'model': 'radial', 'reasons': []}
+    glass = {**row, 'glass_px': 1.0, 'verdict': 'weak', 'readout_ms': 0.0}
+    units = [{'zoom': 1, 'alone': 0.02, 'sigma_alone': 0.02, 'with': 0.01, 'sigma': 0.01,
+              'prior': True}]
+    written = {
+        'population': (summary([row, glass, row]),
+                       [['2', '2', '0', '1', '0', '50.0', '100.0'], ['0.31', '0.31'],
+                        ['2.0', '0', '2']]),
+        'fleet': (report({'prior': [{'seed': 1, 'units': units}]}),
+                  [['1', '1', '2.00', '1.00']]),
+        'held_out': ('1 of 2 accepted drives, 7 of 10 turns within σ0 + σ1.', [['7', '10']]),
+        'check': (table(['calibration', 'right', 'differs', 'wrong', 'cannot tell', 'found', 'px'],
+                        [['truth', '5', '1', '2', '3', '', '0.2'],
+                         ['fx +', '0', '0', '9', '2', '8 of 9', '5'],
+                         ['k1 +', '0', '0', '9', '2', '7 of 9', '5']]),
+                  [['11', '2', '8', '9', '7', '9']]),
+        'node_drive': ('| **KITTI 03** | accepted |\n| fx | 714.5123 ± 1.3, reference 717.1456, '
+                       'difference -0.4 % |', [['714.5', '717.1']])}
+    for name, (text, expected) in written.items():
+        seen = [[number for source in figure.sources for number in source(text)]
+                for figure in FIGURES if figure.table == name]
+        assert [numbers for n, numbers in enumerate(seen) if numbers not in seen[:n]] == expected
