@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Videos that no fixed camera takes, and other bad ones: none may be accepted and wrong.
 
-    python benchmark/attacks.py [ATTACK ...] [--films NAME ...] [--seeds 0 1 2] [--data DIR]
-                                [--cache DIR] [--out DIR] [--again] [--list] [--summary]
+    python benchmark/attacks.py [ATTACK ...] [--drives NAME ...] [--seeds 0 1 2] [--data DIR]
+                                [--cache DIR] [--out DIR] [--results] [--again] [--list]
+                                [--summary]
 
 Each attack changes the pictures or the stamps of a drive of which the camera is known. A row goes
 to DIR/attacks.json after each, and one that is there is not run again; DIR/attacks.md counts them:
@@ -31,6 +32,7 @@ from measure import (
     commit,
     done,
     isolated,
+    keep_table,
     load,
     mapping_cell,
     parser_with,
@@ -38,7 +40,6 @@ from measure import (
     summarised,
     table,
 )
-from result_tables import write_table
 from scipy.ndimage import gaussian_filter1d
 from views import INEXACT, inexact_view
 from wide import WIDE, wide_drive_of
@@ -584,9 +585,8 @@ def _lines(row: Mapping[str, Any]) -> Iterator[str]:
 
 
 def main() -> None:
-    parser = parser_with(__doc__ or '', 'seeds', 'data', 'cache', 'out', 'results', 'again')
+    parser = parser_with(__doc__, 'seeds', 'drives', 'data', 'cache', 'again', drives=FILMS)
     parser.add_argument('attacks', nargs='*', help='parts of names; default: all')
-    parser.add_argument('--films', nargs='+', default=list(FILMS))
     parser.add_argument('--list', action='store_true', help='name the attacks, and end')
     parser.add_argument('--summary', action='store_true', help='of the rows there are, and end')
     options = parser.parse_args()
@@ -600,7 +600,7 @@ def main() -> None:
     cache = options.cache or Path('measured') / 'pictures'
     cache.mkdir(parents=True, exist_ok=True)
     for seed in () if options.summary else options.seeds:
-        for film in options.films:
+        for film in options.drives:
             if film in RECORDED and (options.data is None or seed != options.seeds[0]):
                 continue
             for name in names:
@@ -614,12 +614,7 @@ def main() -> None:
                              'took_s': round(time.monotonic() - started, 1), 'commit': commit()}
                 save(path, rows)
                 print('\n'.join(_lines(rows[key])), flush=True)
-    text = summary(rows)
-    if rows:
-        (options.out / 'attacks.md').write_text(text + '\n')
-    if rows and options.results:
-        write_table('attacks', text, [row['commit'] for row in rows.values()])
-    print(text)
+    keep_table('attacks', summary(rows), options, [row['commit'] for row in rows.values()])
 
 
 if __name__ == '__main__':

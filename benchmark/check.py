@@ -2,8 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether `dashcalib check` finds what is wrong with a calibration, on rendered drives.
 
-    python benchmark/check.py [NAME ...] [--seeds 0 1 2] [--data DIR] [--cache DIR]
-        [--out DIR] [--again] [--solved]
+    python benchmark/check.py [--drives NAME ...] [--seeds 0 1 2] [--data DIR] [--cache DIR]
+        [--out DIR] [--results] [--again] [--solved]
+
+The drives are all rendered ones, and for monitor.py those of --data.
 
 Each drive is solved once (the cache keeps the solution), and then asked about its true camera,
 about that shifted by half a pixel, and about spoiled ones: fx 2 %, k1 0.03, cx 1 %, cy 2 % to
@@ -24,7 +26,7 @@ from typing import Any
 import numpy as np
 from drives import BY_NAME
 from mapping import model_of
-from measure import commit, complain, load, parser_with, save, table
+from measure import commit, complain, keep_table, load, parser_with, save, table
 from solutions import RECORDED, Solved, solution_path, solved_drive
 from wide import WIDE
 
@@ -142,15 +144,15 @@ def _median(values: Iterable[float | None]) -> str:
 
 def main() -> None:
     """Ask every drive."""
-    parser = parser_with(__doc__, 'seeds', 'data', 'cache', 'out', 'again')
-    parser.add_argument('names', nargs='*', help='default: all rendered drives')
+    parser = parser_with(__doc__, 'seeds', 'drives', 'data', 'cache', 'again')
     parser.add_argument('--solved', action='store_true', help='only those that are solved already')
     arguments = parser.parse_args()
     cache = arguments.cache or Path('measured/cache')
+    names = arguments.drives or [*BY_NAME, *WIDE, *(RECORDED if arguments.data else ())]
     path = arguments.out / 'check.json'
     rows = load(path)
     for seed in arguments.seeds:
-        for name in arguments.names or [*BY_NAME, *WIDE]:
+        for name in names:
             key = f'{name}, seed {seed}'
             if key in rows and not arguments.again:
                 continue
@@ -162,9 +164,7 @@ def main() -> None:
             save(path, rows)
             complain(f'{key}: ' + ', '.join(
                 f'{what} {row["answer"]}' for what, row in rows[key]['answers'].items()))
-    text = tables(rows.values())
-    (arguments.out / 'check.md').write_text(text + '\n')
-    print(text)
+    keep_table('check', tables(rows.values()), arguments, [row['commit'] for row in rows.values()])
 
 
 if __name__ == '__main__':

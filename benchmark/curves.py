@@ -3,19 +3,22 @@
 """The paper's curves: error of each parameter against number of turns and against frame rate.
 
     python benchmark/curves.py [--seeds 0 1 2] [--turns 1 2 3 ...] [--data DIR]
-                               [--cache DIR] [--out DIR] [--again] [--plot]
+                               [--cache DIR] [--out DIR] [--results] [--again] [--plot]
 
 Turns: one rendered drive of ten turns for each seed; each turn is reconstructed once, and the n
 most prominent are solved together. Rates: one drive of five turns for each seed, rendered at
 10 fps, of which every k-th frame is taken; with --data also kitti03's. Points go to
-DIR/curves.json as they come; DIR/curves_turns.svg and curves_rate.svg are drawn from it (--plot:
-do only that; needs matplotlib). Line: median over the rendered drives; points: the drives, marked
+DIR/curves.json as they come; DIR/curves_turns.png and curves_rate.png are drawn from it (--plot:
+do only that; needs matplotlib); --results puts them and the table into benchmark/results/.
+
+Line: median over the rendered drives; points: the drives, marked
 by their verdicts; shaded: up to the median sigma, which is what the errors should look like.
 """
 from __future__ import annotations
 
 import argparse
 import json
+import shutil
 import statistics
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
@@ -32,13 +35,16 @@ from measure import (
     complain,
     done,
     isolated,
+    keep_table,
     load,
     parser_with,
     reconstructed,
     save,
     solved,
     summarised,
+    table,
 )
+from result_tables import RESULTS
 
 from dashcalib_ros import Config, open_frames
 from dashcalib_ros.detect.detection import detect
@@ -112,8 +118,6 @@ def plot(rows: Sequence[Mapping[str, Any]], curve: str, path: Path) -> None:
     """Draw one curve: a panel for each parameter."""
     import matplotlib
     matplotlib.use('agg')
-    # the same data gives the same file
-    matplotlib.rcParams['svg.hashsalt'] = 'dashcalib'
     import matplotlib.pyplot as plt
     label = {'turns': 'turns wanted', 'rate': 'frames per second'}[curve]
     chosen = sorted((row for row in rows if row['curve'] == curve), key=lambda row: row['x'])
@@ -140,8 +144,23 @@ def plot(rows: Sequence[Mapping[str, Any]], curve: str, path: Path) -> None:
         panel.set_xlabel(label)
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc='outside lower center', ncols=4, frameon=False)
-    figure.savefig(path, metadata={'Date': None})
+    figure.savefig(path, dpi=80, metadata={'Software': None})
     plt.close(figure)
+
+
+def medians(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return the median error over the rendered drives, and what became of them."""
+    lines = []
+    for curve, x in sorted({(row['curve'], row['x']) for row in rows}):
+        here = [row for row in rows if (row['curve'], row['x']) == (curve, x)
+                and row['drive'] != 'kitti03']
+        found = [row['percent'] for row in here if 'percent' in row]
+        lines.append([
+            f'turns: {x:.0f}' if curve == 'turns' else f'{x:.1f} Hz',
+            f'{sum(row["verdict"] == "accepted" for row in here)} of {len(here)}',
+            *(f'{statistics.median(each[key] for each in found):.2f}' if found else ''
+              for key in KEYS)])
+    return table(['', 'accepted', *(f'{key} %' for key in KEYS)], lines)
 
 
 def _points(panel: Any, rows: Sequence[Mapping[str, Any]], key: str, ceiling: float) -> None:
@@ -164,7 +183,7 @@ def _points(panel: Any, rows: Sequence[Mapping[str, Any]], key: str, ceiling: fl
 
 def main() -> None:
     """Run what is asked for."""
-    parser = parser_with(__doc__, 'seeds', 'data', 'cache', 'out', 'again')
+    parser = parser_with(__doc__, 'seeds', 'data', 'cache', 'again')
     parser.add_argument('--turns', nargs='+', type=int, default=list(range(1, 11)))
     parser.add_argument('--plot', action='store_true', help='of the rows there are, and end')
     arguments = parser.parse_args()
@@ -174,8 +193,12 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as passing:
             measure(arguments, rows, path, Path(passing))
     for curve in ('turns', 'rate'):
-        plot(list(rows.values()), curve, arguments.out / f'curves_{curve}.svg')
-        print(arguments.out / f'curves_{curve}.svg')
+        plot(list(rows.values()), curve, arguments.out / f'curves_{curve}.png')
+    if arguments.results:
+        for name in ('curves_turns.png', 'curves_rate.png'):
+            shutil.copy(arguments.out / name, RESULTS / name)
+    keep_table('curves', medians(list(rows.values())), arguments,
+               [row['commit'] for row in rows.values()])
 
 
 if __name__ == '__main__':

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Would a sensor find turns that pictures miss, and are they worth anything?
 
-    python benchmark/dark.py [--films NAME ...] [--data DIR] [--cache DIR]
+    python benchmark/dark.py [--drives NAME ...] [--data DIR] [--cache DIR] [--results]
 
 Pictures become dark, or wet. Each true turn is reconstructed as if a sensor had found it; beside
 that, which of them pictures find. A line for each film and degree.
@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from attacks import Film, Grey, film_of
-from measure import parser_with
+from measure import complain, keep_table, parser_with, table
 
 from dashcalib_ros import Config
 from dashcalib_ros.detect import Turn
@@ -52,8 +52,8 @@ def true_turns(film: Film) -> list[int]:
     return sorted(found)
 
 
-def line(film: Film, gain: float, noise: float, streaks: int) -> str:
-    """Return what becomes of a film that is spoilt so much."""
+def cells(film: Film, gain: float, noise: float, streaks: int) -> list[str]:
+    """Return what becomes of a film that is spoilt so much: a row of the table."""
     config, rng = Config(), np.random.default_rng(0)
     frames = [replace(frame, image=spoilt(frame.image, gain, noise, streaks, rng))
               for frame in film.frames]
@@ -69,22 +69,24 @@ def line(film: Film, gain: float, noise: float, streaks: int) -> str:
         scenes.append(reconstruct(turn, config, detection.valid()))
     good = [scene for scene in scenes if scene is not None]
     solution = solve(good, config) if good else None
-    sigma = '' if solution is None else (
-        f', sigma of fx {100 * solution.sigma[0] / solution.camera.fx:.2f} %')
-    return (f'gain {gain}, noise {noise}, {streaks} streaks: of {len(turns)} turns {seen} found, '
-            f'{len(good)} reconstructed{sigma}')
+    return [f'{gain:g}', f'{noise:g}', str(streaks), str(len(turns)), str(seen), str(len(good)),
+            '' if solution is None else
+            f'{100 * solution.sigma[0] / solution.camera.fx:.2f}']
 
 
 def main() -> None:
-    parser = parser_with(__doc__ or '', 'data', 'cache')
-    parser.add_argument('--films', nargs='+', default=['kitti07', 'dashcam: bonnet, text'])
-    options = parser.parse_args()
+    options = parser_with(__doc__, 'drives', 'data', 'cache',
+                          drives=('kitti07', 'dashcam: bonnet, text')).parse_args()
     cache = options.cache or Path('measured') / 'pictures'
     cache.mkdir(parents=True, exist_ok=True)
-    for name in options.films:
+    rows = []
+    for name in options.drives:
         film = film_of(name, 0, options.data, cache)
         for degree in DEGREES:
-            print(f'{name}: {line(film, *degree)}', flush=True)
+            rows.append([name, *cells(film, *degree)])
+            complain(' '.join(rows[-1]))
+    keep_table('dark', table(['drive', 'gain', 'noise', 'streaks', 'turns', 'found by pictures',
+                              'reconstructed', 'sigma of fx, %'], rows), options)
 
 
 if __name__ == '__main__':

@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's ablation: what leaving the ego vehicle out of the picture is worth.
 
-    python benchmark/ego_mask.py [--seeds 0 1 2] [--lenses dashcam wide] [--out DIR]
+    python benchmark/ego_mask.py [--seeds 0 1 2] [--drives dashcam wide] [--out DIR]
+                                 [--results]
 
 Rendered drives behind bonnet, pillar and time stamp, each calibrated with the automatic mask,
 without any, and with the renderer's own: what it paints over, and 1 % of the width around it, for
@@ -19,7 +20,17 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
-from measure import KEYS, commit, error_cells, load, parser_with, save, summarised, table
+from measure import (
+    KEYS,
+    commit,
+    error_cells,
+    keep_table,
+    load,
+    parser_with,
+    save,
+    summarised,
+    table,
+)
 
 from dashcalib_ros import Calibrator, Config
 from dashcalib_ros.demo import Drive, DriveSpec, Lens
@@ -92,12 +103,10 @@ def report(rows: Mapping[str, Mapping[str, Any]]) -> str:
 
 def main() -> None:
     """Run what is asked for."""
-    parser = parser_with(__doc__, 'seeds', 'out')
-    parser.add_argument('--lenses', nargs='+', choices=LENSES, default=[*LENSES])
-    arguments = parser.parse_args()
+    arguments = parser_with(__doc__, 'seeds', 'drives', drives=LENSES).parse_args()
     path = arguments.out / 'ego_mask.json'
     rows = load(path)
-    for name in arguments.lenses:
+    for name in arguments.drives:
         for seed in arguments.seeds:
             wanted = {f'{name}, seed {seed}, {way}': way for way in WAYS}
             if wanted.keys() <= rows.keys():
@@ -112,9 +121,7 @@ def main() -> None:
                                  **calibrated(drive, frames, hidden, way)}
                     save(path, rows)
                     print(key, rows[key]['verdict'], *error_cells(rows[key]), flush=True)
-    text = report(rows)
-    (arguments.out / 'ego_mask.md').write_text(text + '\n')
-    print(text)
+    keep_table('ego_mask', report(rows), arguments, [row['commit'] for row in rows.values()])
 
 
 if __name__ == '__main__':

@@ -2,16 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Are the engines that estimate poses equal? Drives calibrated with each, in one table.
 
-    python benchmark/engines.py [--data DIR] [--cache DIR] [--workers N]
+    python benchmark/engines.py [--data DIR] [--cache DIR] [--workers N] [--results]
 
 fx, its sigma, the verdict and the seconds of processor time of kitti03 and kitti07 (with --data),
-of the first ten settings of accuracy.py and of two demo lenses. Prints Markdown tables. Random
-dashcams: population.py --engine, twice.
+of the first ten settings of accuracy.py and of two demo lenses. Random dashcams: population.py
+--engine, twice.
 """
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -20,7 +19,7 @@ from typing import Any
 
 import numpy as np
 from drives import SETTINGS, drive_of, pictures_of
-from measure import calibrate, commit, complain, isolated, parser_with, processor_s, table
+from measure import calibrate, complain, isolated, keep_table, parser_with, processor_s, table
 
 from dashcalib_ros import Config, open_frames
 from dashcalib_ros.config import COLMAP, OPENCV
@@ -103,10 +102,10 @@ def main() -> None:
         drives.append((name, drive.lens.fx, partial(measured, pictures_of(drive, args.cache))))
     with ThreadPoolExecutor(args.workers) as pool:
         pairs = list(pool.map(lambda drive: with_each_engine(*drive), drives))
-    print(f'Measured at {commit()}, on {os.cpu_count()} cores, {args.workers} drives at a time.\n')
-    print(table(('drive', 'engine', 'verdict', 'fx px', 'off %', 'sigma px', 'CPU s'),
-                [cells(row) for pair in pairs for row in pair]))
-    print(f'\n{compared([(first, second) for first, second in pairs])}')
+    text = table(('drive', 'engine', 'verdict', 'fx px', 'off %', 'sigma px', 'CPU s'),
+                 [cells(row) for pair in pairs for row in pair])
+    text += f'\n\n{compared([(first, second) for first, second in pairs])}'
+    keep_table('engines', text, args)
 
 
 if __name__ == '__main__':

@@ -12,7 +12,6 @@ the pictures that are solved. Rows go to OUT/exact.json, the table is printed.
 """
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -21,9 +20,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from dashcams import AnyLens, Case, Floats, drive_of, load_case, rays_of
-from measure import commit, complain, done, isolated, load, processor_s, save, table
-from population import off, seeds_of
+from measure import commit, complain, done, isolated, load, parser_with, processor_s, save, table
+from population import AnyLens, Case, Floats, drive_of, load_case, off, rays_of
+from result_tables import keep_table
 from wide import WideDrive
 
 from dashcalib_ros import Config
@@ -163,12 +162,9 @@ def _spread(values: Iterable[float], digits: int) -> str:
 
 def main() -> None:
     """Measure."""
-    parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n')[0])
+    parser = parser_with(__doc__, 'seeds', 'again', seeds=range(5000, 5017))
     parser.add_argument('--cases', type=Path, required=True)
-    parser.add_argument('--seeds', type=seeds_of, required=True, help='a seed, or the first-last')
     parser.add_argument('--noise', nargs='+', type=float, default=[0.0, 0.03, 0.1])
-    parser.add_argument('--out', type=Path, required=True)
-    parser.add_argument('--again', action='store_true')
     parser.add_argument('--summary', action='store_true', help='of the results there are, and end')
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
@@ -184,7 +180,8 @@ def main() -> None:
             if outcome.value:
                 rows[key] = {**outcome.value, 'commit': commit()}
                 save(path, rows)
-    print(summary(list(rows.values())))
+    keep_table('exact', summary(list(rows.values())), given,
+               [row['commit'] for row in rows.values() if 'commit' in row])
 
 
 if __name__ == '__main__':

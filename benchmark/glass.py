@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rendered drives through a windscreen, a poor rectification, a decentred lens; exact truth.
 
-    python benchmark/glass.py [PART ...] [--seeds 0 1 2] [--cache DIR] [--out DIR] [--results]
-                              [--again]
+    python benchmark/glass.py [--drives PART ...] [--seeds 0 1 2] [--cache DIR] [--out DIR]
+                              [--results] [--again]
 
 PART: part of a setting's name; default: all. The decentred lens is run on ten streets, whatever
 --seeds says. Rows go to DIR/glass.json after each drive, the table to benchmark/results/glass.md.
@@ -19,8 +19,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from drives import DEMO, STREET, Setting, drive_of, pictures_of
-from measure import calibrate, commit, complain, done, isolated, load, parser_with, save, table
-from result_tables import write_table
+from measure import (
+    calibrate,
+    commit,
+    complain,
+    done,
+    isolated,
+    keep_table,
+    load,
+    parser_with,
+    save,
+    table,
+)
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -118,15 +128,13 @@ def summary(rows: Mapping[str, Mapping[str, Any]]) -> str:
 
 def main() -> None:
     """Measure."""
-    parser = parser_with(__doc__, 'cache', 'seeds', 'out', 'results', 'again')
-    parser.add_argument('parts', nargs='*')
-    arguments = parser.parse_args()
+    arguments = parser_with(__doc__, 'cache', 'seeds', 'drives', 'again').parse_args()
     path = arguments.out / 'glass.json'
     rows = load(path)
     with TemporaryDirectory() as passing:
         for name, seed, drive in drives(arguments.seeds):
             key = f'{name}, seed {seed}'
-            if not all(part in key for part in arguments.parts) or (
+            if not all(part in key for part in arguments.drives or ()) or (
                     done(rows.get(key)) and not arguments.again):
                 continue
             pictures = pictures_of(drive, arguments.cache or Path(passing))
@@ -135,10 +143,7 @@ def main() -> None:
                          **(outcome.value or {'verdict': 'failed', 'reasons': [outcome.failure]})}
             save(path, rows)
             complain(f'{key}: {rows[key]}')
-    text = summary(rows)
-    print(text)
-    if arguments.results:
-        write_table('glass', text, [row['commit'] for row in rows.values()])
+    keep_table('glass', summary(rows), arguments, [row['commit'] for row in rows.values()])
 
 
 if __name__ == '__main__':

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What each turn says of the calibration without it, over all drives that are solved.
 
-    python benchmark/held_out.py --cache DIR [--out DIR] [--refit NAME ...]
+    python benchmark/held_out.py --cache DIR [--out DIR] [--results] [--refit NAME ...]
 
 Reads the solutions that check.py keeps in the cache. A drive passes where no turn differs from the
 others by more than the sum of both sigmas. --refit: for these drives, the cameras that the linear
@@ -15,8 +15,8 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-from measure import complain, parser_with, table
-from solutions import RECORDED, Solved
+from measure import complain, keep_table, parser_with, table
+from solutions import RECORDED, Solved, solution_path
 
 from dashcalib_ros import Config
 from dashcalib_ros.camera import Camera
@@ -26,9 +26,12 @@ from dashcalib_ros.solve.solution import Solution, cross_validation
 
 
 def solved_drives(cache: Path) -> list[Solved]:
-    """Return all drives in the cache."""
-    return [Solved(**pickle.loads(path.read_bytes()))
-            for path in sorted((cache / 'solutions').glob('*.pickle'))]
+    """Return all drives that this commit has solved; ends the script where there is none."""
+    found = [Solved(**pickle.loads(path.read_bytes()))
+             for path in sorted(solution_path('', 0, cache).parent.glob('*.pickle'))]
+    if not found:
+        raise SystemExit('no drive is solved at this commit: run check.py with this --cache')
+    return found
 
 
 def without(solution: Solution, number: int) -> Camera:
@@ -88,16 +91,14 @@ def refit_table(drives: Iterable[Solved], names: Iterable[str]) -> str:
 
 def main() -> None:
     """Measure."""
-    parser = parser_with(__doc__, 'cache', 'out')
+    parser = parser_with(__doc__, 'cache')
     parser.add_argument('--refit', nargs='*', default=[])
     arguments = parser.parse_args()
     drives = solved_drives(arguments.cache)
     text = drives_table(drives)
     if arguments.refit:
         text += f'\n\n{refit_table(drives, arguments.refit)}'
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    (arguments.out / 'held_out.md').write_text(text + '\n')
-    print(text)
+    keep_table('held_out', text, arguments)
 
 
 if __name__ == '__main__':

@@ -5,8 +5,8 @@
     python benchmark/hostile.py [ATTACK ...] [--quick] [--out DIR] [--results] [--again] [--list]
 
 Each attack is tried many times, each try in its own way. A line goes to DIR/hostile.jsonl after
-each try, and one that is there is not tried again; DIR/hostile.md counts them. All of it takes
-half an hour, and --quick two minutes; ROS is needed.
+each try, and one that is there is not tried again; DIR/hostile.md counts them, also those that
+were never tried. All of it takes half an hour, and --quick two minutes; ROS is needed.
 """
 from __future__ import annotations
 
@@ -32,10 +32,9 @@ from typing import Any
 import cv2
 import numpy as np
 import rclpy
-import with_tests  # noqa: F401
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
-from measure import commit, parser_with, table
+from measure import commit, keep_table, parser_with, table
 from processes import processes_of
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import (
@@ -45,7 +44,6 @@ from rcl_interfaces.srv import (
     SetParameters,
     SetParametersAtomically,
 )
-from result_tables import write_table
 from ros_bench import (
     CAMERA_FILE,
     COMMAND,
@@ -380,19 +378,32 @@ def calibration_files(folder: Path, tries: Sequence[int]) -> Iterator[None]:
         yield
 
 
+def spoil(path: Path, n: int) -> None:
+    """Damage a file of arrays: cut it off, or replace it. test/store has what is wrong inside."""
+    whole = path.read_bytes()
+    path.write_bytes((whole[:n * len(whole) // 100], os.urandom(5000), b'')[n % 3])
+    if n % 10 == 9:
+        np.savez(path, weights=np.zeros(n))
+
+
 def stores(folder: Path, tries: Sequence[int]) -> Iterator[None]:
     """A damaged turn costs one warning, and the others stay."""
-    from test_turn_store import CAMERA, SPOILED, hold, stored
+    from fleet_made import YAWS, clip_of
 
+    from dashcalib_ros.detect import TurnId
+    from dashcalib_ros.input.scale import Scale
+    from dashcalib_ros.store.scene_file import Origin
     from dashcalib_ros.store.turn_store import TurnStore
+    origin = Origin((800, 450), Scale(), 'camera')
+    turns = clip_of(yaws=YAWS[:2], tracks=60, keyframes=8).turns
     for n in tries:
         said: list[str] = []
         store = TurnStore(str(folder / str(n)), 10, 3.0, said.append)
-        store.load(CAMERA)
-        hold(store, stored(0), stored(1))
-        list(SPOILED.values())[n % len(SPOILED)](sorted((folder / str(n)).iterdir())[0])
+        store.load(origin)
+        store.mirror({TurnId.at(100 + k): turn for k, turn in enumerate(turns)})
+        spoil(sorted((folder / str(n)).iterdir())[0], n)
         again = TurnStore(str(folder / str(n)), 10, 3.0, said.append)
-        again.load(CAMERA)
+        again.load(origin)
         assert len(again.turns) == 1 and len(said) == 1, said
         yield
 
@@ -591,19 +602,12 @@ def pipes(folder: Path, tries: Sequence[int]) -> Iterator[None]:
 def scene_files(folder: Path, tries: Sequence[int]) -> Iterator[None]:
     """A damaged clip of scenes costs its own row; nothing is written beside the output."""
     from fleet_made import YAWS, clip_of, lens_of, written
-    from test_scene_file import ABOUTS, ARRAYS, damaged
-    from test_turn_store import SPOILED
-    contents = [damaged(about=about) for about in ABOUTS]
-    contents += [damaged(**{f'turn0.{name}': value for name, value in each.items()})
-                 for each in ARRAYS]
-    ways = [*SPOILED.values(), *(lambda path, data=data: path.write_bytes(data)
-                                 for data in contents)]
     for n in tries:
         place = folder / str(n)
         for m in range(2):
             written(clip_of(lens_of(), YAWS[m:m + 1], world=m, tracks=60, keyframes=7),
                     place / f'{m}.npz')
-        ways[n % len(ways)](place / '1.npz')
+        spoil(place / '1.npz', n)
         (place / 'm.csv').write_text('clip,camera\n0.npz,one\n1.npz,one\n')
         before = {path.name for path in place.iterdir()}
         done = subprocess.run(
@@ -1090,7 +1094,7 @@ ATTACKS = [
     Attack('SIGKILL of children that calibrate', 10, 1, child_kills),
     Attack('Ctrl-C at any line', 100, 4, interrupts),
     Attack('a FIFO for a file', 11, 11, pipes),
-    Attack('clips of scenes', 88, 6, scene_files),
+    Attack('clips of scenes', 40, 6, scene_files),
     Attack('two cameras on one stream', 26, 4, two_cameras),
     Attack('two publishers', 20, 3, two_publishers),
     Attack('pictures that take long', 20, 5, slow_pictures),
@@ -1118,19 +1122,21 @@ def tried(attack: Attack, lacking: Sequence[int]) -> Iterator[tuple[int, str]]:
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> str:
-    """Return a line for each attack."""
+    """Return a line for each attack, also where it was not tried."""
     lines = []
     for attack in ATTACKS:
         own = [row for row in rows if row['attack'] == attack.name]
         bad = [row for row in own if row['said']]
-        if own:
-            lines.append([attack.name, f'{len(own) - len(bad)} of {len(own)}', ' '.join(
-                f'try {bad[0]["try"]}: {bad[0]["said"]}'.split())[:200] if bad else ''])
-    return table(['attack', 'held', 'the first that did not'], lines)
+        lines.append([attack.name, f'{len(own) - len(bad)} of {len(own)}' if own else 'not tried',
+                      ' '.join(f'try {bad[0]["try"]}: {bad[0]["said"]}'.split())[:200]
+                      if bad else ''])
+    held = sum(cells[1] != 'not tried' and not cells[2] for cells in lines)
+    return f'{held} of {len(lines)} attacks held.\n\n' + table(
+        ['attack', 'held', 'the first that did not'], lines)
 
 
 def main() -> None:
-    parser = parser_with(__doc__ or '', 'out', 'results', 'again')
+    parser = parser_with(__doc__, 'again')
     parser.add_argument('attacks', nargs='*', help='parts of names; default: all')
     parser.add_argument('--quick', action='store_true', help='a few tries of each')
     parser.add_argument('--list', action='store_true', help='name the attacks, and end')
@@ -1161,11 +1167,8 @@ def main() -> None:
                 if said:
                     print(f'{attack.name}, try {n}: {said}', file=sys.stderr, flush=True)
             print(f'{attack.name}: {count}', flush=True)
-    text = summary(list(rows.values()))
-    (options.out / 'hostile.md').write_text(text + '\n')
-    if options.results:
-        write_table('hostile', text, {row['commit'] for row in rows.values()})
-    print(text)
+    keep_table('hostile', summary(list(rows.values())), options,
+               [row['commit'] for row in rows.values()])
 
 
 if __name__ == '__main__':

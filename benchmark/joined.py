@@ -36,13 +36,13 @@ from measure import (
     complain,
     done,
     isolated,
+    keep_table,
     load,
     parser_with,
     save,
     summarised,
     table,
 )
-from result_tables import write_table
 
 from dashcalib_ros import Config, open_frames
 from dashcalib_ros.detect import MotionEstimator
@@ -190,8 +190,7 @@ def joints_text(drives: Mapping[str, Mapping[tuple[bool, str], Sequence[bool]]])
 
 def main() -> None:
     """Measure."""
-    parser = parser_with(__doc__, 'data', 'cache', 'out', 'results', 'again')
-    parser.add_argument('--drives', nargs='+', default=list(DRIVES))
+    parser = parser_with(__doc__, 'drives', 'data', 'cache', 'again', drives=DRIVES)
     parser.add_argument('--joints', action='store_true', help='ask at each fourth image, and end')
     arguments = parser.parse_args()
     path = arguments.out / 'joined.json'
@@ -227,11 +226,8 @@ def main() -> None:
                 folders = split(pictures, cuts_of(whole['turns'], where), round(lost_s * fps),
                                 Path(passing) / key.replace(' ', '_'), told)
                 measured(key, folders, fps, truth)
-    text = text_of(rows, arguments.drives)
-    (arguments.out / 'joined.md').write_text(text + '\n')
-    if arguments.results:
-        write_table('joined', text, [row['commit'] for row in rows.values()])
-    print(text)
+    keep_table('joined', text_of(rows, arguments.drives), arguments,
+               [row['commit'] for row in rows.values()])
 
 
 if __name__ == '__main__':

@@ -7,7 +7,7 @@ Rendered: a picture each second through lenses that are known, seen by the true 
 spoiled ones. Whole: rendered drives whose solution check.py keeps in the cache: how far lines and
 result are apart.
 Real: KITTI odometry 03, with the dataset's own K and with ours; two drives with the cameras that
-others measured. Writes lines.json, and lines.md with the tables of benchmark/results/lines.md.
+others measured. Rows go to lines.json; --results writes the tables into benchmark/results/.
 """
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from typing import Any
 import cv2
 import numpy as np
 from drives import BY_NAME, _key, drive_of
-from measure import commit, load, parser_with, save, table
+from measure import commit, complain, keep_table, load, parser_with, save, table
 from solutions import solution_path, solved_drive
 from wide import WIDE, wide_drive_of
 
@@ -206,8 +206,7 @@ def _asked(row: Mapping[str, Any]) -> str:
 
 def main() -> None:
     """Measure what is asked for; rows that are there are kept."""
-    parser = parser_with(__doc__ or '', 'seeds', 'data', 'cache', 'out', 'again')
-    parser.add_argument('--drives', nargs='*', help='names of drives.py and wide.py; default: all')
+    parser = parser_with(__doc__, 'seeds', 'drives', 'data', 'cache', 'again')
     options = parser.parse_args()
     file, config = options.out / 'lines.json', Config()
     results = load(file)
@@ -225,12 +224,13 @@ def main() -> None:
                     rows[key] = row_of(name, seed, cache)
                     results[f'{kind}_commit'] = commit()
                     save(file, results)
-                    print(kind, key, rows[key], flush=True)
+                    complain(f'{kind} {key} {rows[key]}')
     for name, rows_of in (('others', other_rows), ('kitti03', kitti_rows)):
         if options.data and (options.again or name not in results):
             results |= {name: rows_of(options.data, config), f'{name}_commit': commit()}
             save(file, results)
-    (options.out / 'lines.md').write_text(written(results))
+    keep_table('lines', written(results), options,
+               [said for key, said in results.items() if key.endswith('commit')])
 
 
 if __name__ == '__main__':

@@ -8,7 +8,6 @@ import json
 import multiprocessing
 import os
 import signal
-import subprocess
 import sys
 import threading
 import time
@@ -19,7 +18,12 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+# what tests and benchmarks share; who imports of it imports this module before
+sys.path.append(str(Path(__file__).resolve().parents[1] / 'testing'))
 from mapping import is_fisheye, mapping_error, model_of
+from result_tables import commit as commit
+from result_tables import keep_table as keep_table
+from result_tables import table as table
 
 from dashcalib_ros import Calibrator, Config
 from dashcalib_ros.arrays import plain_values
@@ -43,9 +47,22 @@ FALSE_PERCENT = 3.0
 SAMPLE_S = 0.25
 
 
+class Seeds(argparse.Action):
+    """Takes numbers and ranges: 0 1 2, 4000-4029."""
+
+    def __call__(self, parser: argparse.ArgumentParser, given: argparse.Namespace, values: Any,
+                 option: str | None = None) -> None:
+        """Keep the numbers."""
+        ends = [(first, last or first) for first, _, last in (
+            text.partition('-') for text in values)]
+        setattr(given, self.dest, [n for first, last in ends
+                                   for n in range(int(first), int(last) + 1)])
+
+
 OPTIONS: dict[str, dict[str, Any]] = {
-    'seeds': {'nargs': '+', 'type': int, 'default': [0, 1, 2]},
-    'data': {'type': Path, 'help': 'a folder with kitti03/ (and carnd/)'},
+    'seeds': {'nargs': '+', 'action': Seeds, 'default': [0, 1, 2], 'metavar': 'N or FIRST-LAST'},
+    'drives': {'nargs': '+', 'metavar': 'NAME', 'help': 'default: all'},
+    'data': {'type': Path, 'help': 'a folder with the recorded drives'},
     'cache': {'type': Path, 'help': 'where rendered pictures are kept'},
     'out': {'type': Path, 'default': Path('measured')},
     'results': {'action': 'store_true', 'help': 'write the table into benchmark/results/, too'},
@@ -301,12 +318,6 @@ def mapping_cell(row: Mapping[str, Any]) -> str:
     return '' if error is None else f'{error:.2f}'
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a Markdown table."""
-    lines = [head, ['---'] * len(head), *rows]
-    return '\n'.join(f'| {" | ".join(line)} |' for line in lines)
-
-
 def load(path: Path) -> dict[str, Any]:
     """Return the results that are there already."""
     return dict(json.loads(path.read_text())) if path.exists() else {}
@@ -325,22 +336,21 @@ def save(path: Path, data: Mapping[str, Any]) -> None:
     fresh.replace(path)
 
 
-def commit() -> str:
-    """Return what code is measured, '+' for uncommitted changes; '' outside a repository."""
-    try:
-        done = subprocess.run(
-            ['git', 'describe', '--always', '--dirty=+', '--exclude=*'],
-            cwd=Path(__file__).parent, capture_output=True, text=True, check=False)
-    except OSError:
-        return ''
-    return done.stdout.strip()
+def parser_with(doc: str | None, *options: str, drives: Iterable[str] = (),
+                seeds: Iterable[int] | None = None) -> argparse.ArgumentParser:
+    """Return a parser with --out, --results and some more of the OPTIONS that benchmarks share.
 
-
-def parser_with(doc: str, *options: str) -> argparse.ArgumentParser:
-    """Return a parser with some of the OPTIONS that benchmarks share; doc: the module's."""
-    parser = argparse.ArgumentParser(description=doc.split('\n')[0])
-    for option in options:
+    doc: the module's. drives, seeds: the defaults.
+    """
+    # a script's own option of the same name counts
+    parser = argparse.ArgumentParser(description=(doc or '').split('\n')[0],
+                                     conflict_handler='resolve')
+    for option in dict.fromkeys((*options, 'out', 'results')):
         parser.add_argument(f'--{option}', **OPTIONS[option])
+    if drives:
+        parser.set_defaults(drives=list(drives))
+    if seeds is not None:
+        parser.set_defaults(seeds=list(seeds))
     return parser
 
 

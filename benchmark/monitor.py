@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """After how many turns the monitor notices a change of the camera, and how often for nothing.
 
-    python benchmark/monitor.py --cache DIR [--drives N] [--seed N] [--out DIR]
+    python benchmark/monitor.py --cache DIR [--simulated N] [--seed N] [--out DIR] [--results]
 
 Reads the solutions that check.py keeps in the cache. Each turn's tracks are mapped to what a
 zoomed, cropped, exchanged or turned camera would have seen of them, and explained with the
@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 from held_out import solved_drives
 from lines import with_more_k1
-from measure import complain, parser_with, table
+from measure import commit, complain, keep_table, parser_with, table
 from scipy.spatial.transform import Rotation
 from solutions import Solved
 
@@ -126,7 +126,7 @@ def library_of(drive: Solved, cache: Path) -> Library:
     """Return a drive with its readings, which come from the cache or are made."""
     assert drive.solution is not None and drive.calibration.sigma is not None
     camera, name = drive.solution.camera, f'{drive.name}, seed {drive.seed}'
-    path = cache / 'readings' / f'{name}.pickle'.replace('/', ' ')
+    path = cache / 'readings' / commit() / f'{name}.pickle'.replace('/', ' ')
     readings = pickle.loads(path.read_bytes()) if path.exists() else {}
     missing = [event for event in EVENTS if event not in readings]
     if missing:
@@ -296,8 +296,8 @@ def _kind_of(change: Change, parts: Sequence[str]) -> str:
 
 def main() -> None:
     """Parse the arguments, print the tables."""
-    parser = parser_with(__doc__, 'cache', 'out')
-    parser.add_argument('--drives', type=int, default=200, help='simulated, for each change')
+    parser = parser_with(__doc__, 'cache')
+    parser.add_argument('--simulated', type=int, default=200, help='drives, for each change')
     parser.add_argument('--seed', type=int, default=0, help='number of the first drive')
     arguments = parser.parse_args()
     libraries = []
@@ -309,13 +309,11 @@ def main() -> None:
         libraries.append(library_of(drive, arguments.cache))
         complain(libraries[-1].name)
     turns = sum(len(each.readings['none']) for each in libraries)
-    simulation = Simulation(libraries, arguments.drives, arguments.seed)
+    simulation = Simulation(libraries, arguments.simulated, arguments.seed)
     text = '\n\n'.join((f'{len(libraries)} lenses, {turns} turns', *(
         made(simulation) for made in (events_table, lenses_table, unproven_table, words_table,
                                       trade_table))))
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    (arguments.out / 'monitor.md').write_text(text + '\n')
-    print(text)
+    keep_table('monitor', text, arguments)
 
 
 if __name__ == '__main__':

@@ -1,15 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a gyro and GPS say of fx: rendered drives, and real ones with poses or sensors.
 
-    python benchmark/motion.py --data data --single 20
-    python benchmark/motion.py --towns 40
+    python benchmark/motion.py [--data data] [--seeds 1 2 3] [--single 20] [--towns 40] [--results]
 
 A gyro is made from true poses: 100 Hz, 0.1 deg/s/sqrt(Hz), bias 0.2 deg/s, 40 ms late, mounted at
 any angle; called calibrated to 0.1 %. A better one has 0.01 deg/s/sqrt(Hz), and 0.03 %.
 """
 from __future__ import annotations
 
-import argparse
 import csv
 import dataclasses
 from collections.abc import Iterable, Iterator, Sequence
@@ -17,11 +15,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import with_tests  # noqa: F401
 from drives import pictures_of
-from made_motion import town
+from measure import complain, keep_table, parser_with, table
 from scipy.spatial.transform import Rotation, RotationSpline
 from solving import with_camera
+from towns import town
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.config import Config
@@ -118,11 +116,11 @@ def scaled(stream: SensorStream, scale: float) -> SensorStream:
 
 
 def row(drive: Driven, stream: SensorStream, sensor: str = 'gyro',
-        scale_sigma: float = CALIBRATED) -> None:
-    """Print what the sensors say, calibrated, and what the result is with that."""
+        scale_sigma: float = CALIBRATED) -> Iterator[list[str]]:
+    """Yield what the sensors say, calibrated, and what the result is with that."""
     found = asked(drive, stream, scale_sigma=scale_sigma)
     for line in found.unused:
-        print(f'{drive.name}: {line}')
+        complain(f'{drive.name}: {line}')
     informed = found.solution or drive.solution
     verdict = judge(informed, Config().verdict, witnesses=found.witnesses).level
     for kind, said in (('gyro', found.witnesses.gyro), ('GPS', found.witnesses.gps)):
@@ -131,14 +129,15 @@ def row(drive: Driven, stream: SensorStream, sensor: str = 'gyro',
         own = 100 * (drive.solution.camera.fx / drive.truth - 1)
         time = ('' if said.time_offset_s is None or said.time_sigma_s is None else
                 f'{1e3 * said.time_offset_s:.1f} ± {1e3 * said.time_sigma_s:.1f}')
-        print(f'| {drive.name}, {sensor if kind == "gyro" else kind} | {time} | {said.scale:.4f} '
-              f'± {said.scale_sigma:.4f} | {drive.off(drive.solution)}, {drive.verdict} | '
-              f'{own + said.fx_percent:+.2f} ± {said.fx_sigma_percent:.2f} | '
-              f'{drive.off(informed)}, {verdict} |', flush=True)
+        yield [f'{drive.name}, {sensor if kind == "gyro" else kind}', time,
+               f'{said.scale:.4f} ± {said.scale_sigma:.4f}',
+               f'{drive.off(drive.solution)}, {drive.verdict}',
+               f'{own + said.fx_percent:+.2f} ± {said.fx_sigma_percent:.2f}',
+               f'{drive.off(informed)}, {verdict}']
 
 
-def harm(drive: Driven, stream: SensorStream) -> None:
-    """Print what sensors do that are off, and what they say of a camera that is."""
+def harm(drive: Driven, stream: SensorStream) -> list[str]:
+    """Return what sensors do that are off, and what they say of a camera that is."""
     solution = drive.solution
     unknown = asked(drive, scaled(stream, 1.03), scale_sigma=Config().motion.gyro_scale_sigma)
     assert unknown.solution is not None
@@ -160,7 +159,7 @@ def harm(drive: Driven, stream: SensorStream) -> None:
         assert all(each.solution is solution for each in found)
         agree = [each.witnesses.gps.agrees for each in found if each.witnesses.gps is not None]
         by_gps.append(f'{len(agree)}, {agree.count(False)}')
-    print(f'| {drive.name} | {moved:.2f} | {" | ".join([*told, *by_gps])} |', flush=True)
+    return [drive.name, f'{moved:.2f}', *told, *by_gps]
 
 
 def made_gyro(drive: Driven, noise: int, scale: float = 1.0) -> SensorStream:
@@ -170,10 +169,9 @@ def made_gyro(drive: Driven, noise: int, scale: float = 1.0) -> SensorStream:
     return scaled(gyro(drive.poses, seed + 1000 * noise), scale)
 
 
-def stated(singles: Sequence[Driven]) -> None:
-    """Print how many single turns are accepted with gyros that are called calibrated."""
-    print('\n| one turn, gyro called calibrated | used and accepted | of these, beyond 2 sigma |\n'
-          '|---|---|---|')
+def stated(singles: Sequence[Driven]) -> str:
+    """Return how many single turns are accepted with gyros that are called calibrated."""
+    lines = []
     for name, gyros in (('right, 4 noises', [(noise, 1.0) for noise in range(4)]),
                         ('3 % wrong, 2 noises', [(noise, scale) for noise in range(2)
                                                  for scale in (0.97, 1.03)])):
@@ -185,8 +183,10 @@ def stated(singles: Sequence[Driven]) -> None:
                 if used is not None and used is not drive.solution and judge(
                         used, Config().verdict, witnesses=found.witnesses).level == 'accepted':
                     accepted.append((used.camera.fx - drive.truth) / used.sigma[0])
-        print(f'| {name} | {len(accepted)} of {len(gyros) * len(singles)} | '
-              f'{sum(abs(each) > 2 for each in accepted)} |', flush=True)
+        lines.append([name, f'{len(accepted)} of {len(gyros) * len(singles)}',
+                      str(sum(abs(each) > 2 for each in accepted))])
+    return table(['one turn, gyro called calibrated', 'used and accepted',
+                  'of these, beyond 2 sigma'], lines)
 
 
 def fixes(poses: Poses, rate_hz: float, noise_m: float, jumps: float, seed: int) -> Samples:
@@ -207,7 +207,7 @@ def pictures(folder: Path, stamps: Iterable[float]) -> Iterator[Frame]:
         yield Frame(index, round(stamp * 1e9), np.asarray(image, np.uint8))
 
 
-def table(path: Path) -> dict[str, Floats]:
+def columns_of(path: Path) -> dict[str, Floats]:
     """Return the columns of a CSV."""
     with path.open() as file:
         rows = list(csv.DictReader(file))
@@ -220,54 +220,48 @@ TOWNS: dict[str, dict[str, float]] = {
     '1 Hz, 0.5 m, 5 % jump by 30 m': {'jumps': 0.05}, '1 Hz, 0.5 m, 0.4 s late': {'late_s': 0.4}}
 
 
-def towns(count: int) -> None:
-    """Print how well GPS knows a gyro's scale: drives of 12 turns on paper, 2 % off."""
-    print('| GPS | answers | sigma, % | error over sigma: RMS, largest |\n|---|---|---|---|')
+def towns(count: int) -> str:
+    """Return how well GPS knows a gyro's scale: drives of 12 turns on paper, 2 % off."""
+    lines = []
     for name, given in TOWNS.items():
         found = [scale_by_gps(*town(seed, scale=1.02, **given)) for seed in range(count)]
         known = np.array([each for each in found if each is not None])
         off = (known[:, 0] - 1.02) / known[:, 1]
-        print(f'| {name} | {len(known)} of {count} | {100 * np.median(known[:, 1]):.2f} | '
-              f'{np.sqrt(np.mean(off**2)):.2f}, {np.abs(off).max():.1f} |')
+        lines.append([name, f'{len(known)} of {count}', f'{100 * np.median(known[:, 1]):.2f}',
+                      f'{np.sqrt(np.mean(off**2)):.2f}, {np.abs(off).max():.1f}'])
+    return table(['GPS, a gyro that is 2 % off', 'answers', 'sigma, %',
+                  'error over sigma: RMS, largest'], lines)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--towns', type=int, default=0, help='drives on paper for GPS and gyro')
-    parser.add_argument('--data', type=Path)
-    parser.add_argument('--seeds', type=int, default=3)
-    parser.add_argument('--single', type=int, default=0, help='single turns that are rendered')
-    parser.add_argument('--cache', type=Path, default=Path('measured/pictures'),
-                        help='where rendered pictures are kept')
+    parser = parser_with(__doc__, 'data', 'seeds', 'cache', seeds=[1, 2, 3])
+    parser.add_argument('--towns', type=int, default=40, help='drives on paper for GPS and gyro')
+    parser.add_argument('--single', type=int, default=20, help='single turns that are rendered')
+    parser.set_defaults(cache=Path('measured/pictures'))
     args = parser.parse_args()
-    if args.towns:
-        towns(args.towns)
-        return
-    drives = []
-    print('| drive | offset, ms | scale | fx by pictures, % | by it alone, % | the result, % |\n'
-          '|---|---|---|---|---|---|')
-    for seed in range(1, args.seeds + 1):
+    drives, lines = [], []
+    for seed in args.seeds:
         drive = rendered(f'rendered {seed}', seed, 5, args.cache)
         assert drive.poses is not None
         drives.append((drive, gyro(drive.poses, seed)))
-        row(*drives[-1])
-        row(drive, gyro(drive.poses, seed, BETTER_DEG), 'a better gyro', BETTER)
-        row(drive, SensorStream(position=fixes(drive.poses, 5.0, 0.02, 0.0, seed)))
+        lines += [*row(*drives[-1]),
+                  *row(drive, gyro(drive.poses, seed, BETTER_DEG), 'a better gyro', BETTER),
+                  *row(drive, SensorStream(position=fixes(drive.poses, 5.0, 0.02, 0.0, seed)))]
     singles = [rendered(f'one turn {seed}', seed, 1, args.cache)
                for seed in range(100, 100 + args.single)]
     for drive in singles:
-        row(drive, made_gyro(drive, 0))
-    if args.data is not None:
-        for drive, stream in real(args.data):
-            row(drive, stream)
-            drives.append((drive, stream))
-    print('\n| drive | gyro 3 % wrong: fx moves by, sigma | called calibrated | a camera 2 % too '
-          f'long | {TRACKS} tracks of 1 Hz, 3 m: speak, contradict | and jumps |\n'
-          '|---|---|---|---|---|---|')
-    for drive, stream in drives:
-        harm(drive, stream)
-    if singles:
-        stated(singles)
+        lines += row(drive, made_gyro(drive, 0))
+    for drive, stream in real(args.data) if args.data else ():
+        lines += row(drive, stream)
+        drives.append((drive, stream))
+    keep_table('motion', '\n\n'.join([
+        table(['drive', 'offset, ms', 'scale', 'fx by pictures, %', 'by it alone, %',
+               'the result, %'], lines),
+        table(['drive', 'gyro 3 % wrong: fx moves by, sigma', 'called calibrated',
+               'a camera 2 % too long', f'{TRACKS} tracks of 1 Hz, 3 m: speak, contradict',
+               'and jumps'], [harm(*each) for each in drives]),
+        *([stated(singles)] if singles else []),
+        *([towns(args.towns)] if args.towns else [])]), args)
 
 
 def real(data: Path) -> Iterator[tuple[Driven, SensorStream]]:
@@ -278,11 +272,11 @@ def real(data: Path) -> Iterator[tuple[Driven, SensorStream]]:
     yield Driven('kitti03', *solved(open_frames(data / 'kitti03' / 'bag')), 718.2, made), gyro(
         made, 1)
     folder = data / 'kitti07'
-    when = table(folder / 'odom.csv')['stamp_s']
+    when = columns_of(folder / 'odom.csv')['stamp_s']
     made = poses_of(when, np.loadtxt(folder / 'poses.txt').reshape(-1, 3, 4))
     yield Driven('kitti07', *solved(pictures(folder, when)), 701.9, made), gyro(made, 1)
     folder = data / 'kitti_raw'
-    when, own = table(folder / 'images.csv')['stamp_s'], table(folder / 'oxts.csv')
+    when, own = columns_of(folder / 'images.csv')['stamp_s'], columns_of(folder / 'oxts.csv')
     yield Driven('kitti_raw', *solved(pictures(folder, when)), 984.2439), SensorStream(
         rate=Samples(own['stamp_s'], np.stack([own[name] for name in ('wx', 'wy', 'wz')], axis=1)),
         position=Samples(own['stamp_s'], local_metres(own['lat'], own['lon'], own['alt'])))

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A camera that is moved on the car within a drive: how often it is told, and told for nothing.
 
-    python benchmark/moved.py [--drives 100] [--degrees 1.0] [--metres 200]
+    python benchmark/moved.py [--count 100] [--degrees 1.0] [--metres 200] [--results]
 
 Made pairs of images: noise of 0.3 px, a body that nods, streets of 20 to 80 m on each of which
 the car's yaw and pitch differ by 0.15 degrees (crowns and slopes), 200 to 800 m of straights; the
@@ -11,14 +11,13 @@ asked, as a recorded one is, and its newest pairs again and again, as the node d
 """
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 
 import numpy as np
-import with_tests  # noqa: F401
+from measure import keep_table, parser_with, table
 from solving import scenes_of, solved, with_camera
+from straight_pairs import SPACING_S, SPEED, mounted, pairs_of
 from synthetic import LENS
-from test_mount import SPACING_S, SPEED, mounted, pairs_of
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.detect.straights import Straights
@@ -63,15 +62,14 @@ def told_live(pairs: Straights) -> bool:
 
 def main() -> None:
     """Measure."""
-    parser = argparse.ArgumentParser(description=__doc__,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--drives', type=int, default=100)
+    parser = parser_with(__doc__)
+    parser.add_argument('--count', type=int, default=100, help='of drives')
     parser.add_argument('--degrees', type=float, default=1.0)
     parser.add_argument('--metres', type=float, default=200.0)
     arguments = parser.parse_args()
     known = replace(with_camera(solved(scenes_of(3)), LENS), scenes=())
     told, place, nothing, live, idle = 0, [], 0, 0, 0
-    for seed in range(arguments.drives):
+    for seed in range(arguments.count):
         rng = np.random.default_rng(seed)
         angles = rng.uniform(-3.0, 3.0, 2)
         way = rng.uniform(0.0, 2.0 * np.pi)
@@ -89,10 +87,14 @@ def main() -> None:
             told += 1
             count = sum(map(len, before)) - 1
             place.append(PAIR_M * abs(found.moved_s / (SPACING_S / 2) - count))
-    print(f'{arguments.degrees:g} degrees, {arguments.metres:g} m after: told in {told} of '
-          f'{arguments.drives}, {np.median(place or [np.nan]):.0f} m from the place in the median '
-          f'(worst {max(place, default=np.nan):.0f}); told for nothing in {nothing}; '
-          f'by the node: {live}, for nothing {idle}')
+    of = f'of {arguments.count}'
+    far = f'{np.median(place or [np.nan]):.0f}, {max(place, default=np.nan):.0f}'
+    text = f'{arguments.degrees:g}°, {arguments.metres:g} m after the move.\n\n'
+    keep_table('moved', text + table(
+        ['', 'recorded drive', 'as the node asks'],
+        [['moved: found', f'{told} {of}', f'{live} {of}'],
+         ['not moved: found', f'{nothing} {of}', f'{idle} {of}'],
+         ['m from the place: median, most', far, '']]), arguments)
 
 
 if __name__ == '__main__':

@@ -1,17 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """A drive at its own rate through DDS into the node: how soon, how right, and nothing before.
 
-    python benchmark/node_drive.py                     the demo's drive, exact truth
-    python benchmark/node_drive.py --bag kitti03/bag   a recorded one, against dashcalib run
+    python benchmark/node_drive.py [--data DIR] [--results]
 
-Prints when camera_info began, counted from the end of the turn that completes the evidence; how
-many images after that were without one; how many pairs a rectifier gets that matches stamps
-exactly; what the node warned of; and the result against the truth, or against the same drive
-through `dashcalib run`.
+The demo's drive, with exact truth; with --data also KITTI 03, against `dashcalib run`. Tells when
+camera_info began, counted from the end of the turn that completes the evidence; how many images
+after that were without one; how many pairs a rectifier gets that matches stamps exactly; what the
+node warned of; and the result beside the reference.
 """
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
@@ -25,8 +23,7 @@ from typing import Any
 import cv2
 import numpy as np
 import rclpy
-import with_tests  # noqa: F401
-from measure import unit_s
+from measure import keep_table, parser_with, table, unit_s
 from ros_bench import Bench, NodeProcess, image_message, ros_environment
 from sensor_msgs.msg import Image
 
@@ -144,45 +141,47 @@ def drive(frames: Iterable[Frame], turns: list[int], half_width: float
         node.kill()
 
 
-def against(text: str | None, reference: dict[str, float]) -> None:
-    """Print a saved calibration beside a reference."""
+def against(text: str | None, reference: dict[str, float]) -> list[list[str]]:
+    """Return a saved calibration beside a reference."""
     if text is None:
-        print('no calibration')
-        return
+        return [['calibration', 'none']]
     from dashcalib_ros.formats.load import parse_camera
     camera = parse_camera(text, 'the node')
+    rows = []
     for name, value in reference.items():
         mine = camera.camera.named[name]
         sigma = (camera.sigma or {})[name]
-        print(f'{name}: node {mine:.4f}, reference {value:.4f}, '
-              f'difference {100 * (mine / value - 1) if value else 0:+.2f} %, sigma {sigma:.4f}')
+        rows.append([name, f'{mine:.4f} ± {sigma:.4f}, reference {value:.4f}, '
+                     f'difference {100 * (mine / value - 1) if value else 0:+.2f} %'])
+    return rows
 
 
 def main() -> None:
     """Parse the arguments."""
-    parser = argparse.ArgumentParser(description=__doc__.split('\n')[0])
-    parser.add_argument('--bag', type=Path, help='a recorded drive instead of the rendered one')
-    args = parser.parse_args()
+    args = parser_with(__doc__, 'data').parse_args()
     half_width = Config().turns.half_width
-    print(f'a fixed piece of work, SIFT of 40 pictures: {unit_s():.2f} CPU s')
-    if args.bag is None:
-        demo = demo_drive(0)
-        frames = list(demo.frames(processes=2))
-        seen = drive(frames, list(demo.turn_centers), half_width)
-        text = seen.pop('calibration')
-        print(json.dumps(seen, indent=1))
-        against(text, demo.truth)
-        return
-    seen = drive(iter(open_frames(args.bag)), [], half_width)
+    rows = [['a fixed piece of work, SIFT of 40 pictures', f'{unit_s():.2f} CPU s']]
+    demo = demo_drive(0)
+    seen = drive(list(demo.frames(processes=2)), list(demo.turn_centers), half_width)
     text = seen.pop('calibration')
-    print(json.dumps(seen, indent=1))
-    with tempfile.TemporaryDirectory() as out:
-        subprocess.run([sys.executable, '-m', 'dashcalib_ros', 'run', str(args.bag), '--out',
-                        out], check=False, stdout=subprocess.DEVNULL)
-        result = json.loads((Path(out) / 'result.json').read_text())
-    print('dashcalib run:', result['verdict'], result['reasons'])
-    if result['intrinsics']:
-        against(text, result['intrinsics'])
+    rows += [['**the demo at 10 Hz**', ''], *lines_of(seen), *against(text, demo.truth)]
+    if args.data is not None:
+        bag = args.data / 'kitti03' / 'bag'
+        seen = drive(iter(open_frames(bag)), [], half_width)
+        text = seen.pop('calibration')
+        with tempfile.TemporaryDirectory() as out:
+            subprocess.run([sys.executable, '-m', 'dashcalib_ros', 'run', str(bag), '--out', out],
+                           check=False, stdout=subprocess.DEVNULL)
+            result = json.loads((Path(out) / 'result.json').read_text())
+        rows += [['**KITTI 03 at its own rate**, reference: `dashcalib run`', result['verdict']],
+                 *lines_of(seen), *against(text, result['intrinsics'] or {})]
+    keep_table('node_drive', table(['', ''], rows), args)
+
+
+def lines_of(seen: dict[str, Any]) -> list[list[str]]:
+    """Return what was seen of a drive."""
+    return [[name, '; '.join(value) if isinstance(value, list) else str(value)]
+            for name, value in seen.items()]
 
 
 if __name__ == '__main__':

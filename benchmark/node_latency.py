@@ -24,9 +24,7 @@ from typing import Any
 
 import numpy as np
 import rclpy
-import with_tests  # noqa: F401
-from measure import commit, unit_s
-from result_tables import write_table
+from measure import keep_table, parser_with, unit_s
 from ros_bench import LARGE_IMAGES, Bench, NodeProcess, image_message, ros_environment
 from sensor_msgs.msg import CompressedImage
 
@@ -180,11 +178,9 @@ def report(bench: Listener, sent: int, spent: dict[bool, Any], memory: list[floa
 
 def main() -> None:
     """Parse the arguments; --publish is for the second process."""
-    parser = argparse.ArgumentParser(description=__doc__.split('\n')[0])
+    parser = parser_with(__doc__)
     parser.add_argument('--minutes', type=float, default=10.0)
     parser.add_argument('--rate', type=float, default=30.0)
-    parser.add_argument('--results', action='store_true',
-                        help='write the table into benchmark/results/, too')
     parser.add_argument('--preview', action='store_true', help='subscribe the pictures')
     parser.add_argument('--publish', action='store_true', help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -194,9 +190,7 @@ def main() -> None:
     unit = unit_s()
     text = measure(args.minutes, args.rate, args.preview)
     text += f'\n| a fixed piece of work: SIFT of 40 pictures | {unit:.2f} CPU s |'
-    if args.results:
-        write_table('node_latency', text, [commit()])
-    print(text)
+    keep_table('node_latency', text, args)
 
 
 if __name__ == '__main__':

@@ -31,10 +31,9 @@ from typing import Any
 import cv2
 import numpy as np
 import rclpy
-import with_tests  # noqa: F401
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
-from measure import commit
+from measure import keep_table, parser_with
 from node_latency import LENS, SIZE, Listener, cpu_s, resident_mb
 from ros_bench import LARGE_IMAGES, Bench, NodeProcess, image_message, ros_environment
 
@@ -231,7 +230,7 @@ def report(bench: Recorder, log: str, sent: list[int], restarts: int, memory: li
 
 def main() -> None:
     """Parse the arguments; --publish is for the second process."""
-    parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n')[0])
+    parser = parser_with(__doc__)
     parser.add_argument('--minutes', type=float, default=60.0)
     parser.add_argument('--restart', type=float, default=RESTART_S, help='s between restarts')
     parser.add_argument('--publish', nargs=3, help=argparse.SUPPRESS)
@@ -246,7 +245,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix='dashcalib-soak-') as name:
         render(Path(name))
         text, broken = measure(args.minutes, args.restart, Path(name))
-    print(f'Measured at {commit()}, on {os.cpu_count()} cores.\n\n{text}')
+    text += '\n\n' + ('\n'.join(f'- Did not hold: {line}' for line in broken)
+                      or 'All limits held.')
+    keep_table('node_soak', text, args)
     sys.exit('\n'.join(broken) or None)
 
 

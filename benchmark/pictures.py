@@ -38,8 +38,6 @@ from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.solve.start import summed
 
 matplotlib.use('agg')
-# the same data gives the same files
-matplotlib.rcParams['svg.hashsalt'] = 'dashcalib'
 matplotlib.rcParams['font.size'] = 9
 import matplotlib.pyplot as plt  # noqa: E402 (after the choice of the backend)
 
@@ -216,11 +214,9 @@ def sigma(seen: Measured) -> None:
 
 
 def _save(figure: plt.Figure, name: str) -> None:
-    path = PLOTS / f'{name}.svg'
-    figure.savefig(path, metadata={'Date': None})
+    # without the version of matplotlib: the same data gives the same file
+    figure.savefig(PLOTS / f'{name}.png', dpi=110, metadata={'Software': None})
     plt.close(figure)
-    # no blanks at line ends in what is committed
-    path.write_text('\n'.join(line.rstrip() for line in path.read_text().splitlines()) + '\n')
 
 
 def mount() -> None:
@@ -247,8 +243,7 @@ def mount() -> None:
     panels[1].plot((0, 5), (0, 0), color='0.4')
     panels[1].annotate('', (2.7, 0), (2.7, 1.3), arrowprops={'arrowstyle': '<->'})
     panels[0].text(4.4, -0.3, 'direction of travel', color='0.4')
-    figure.savefig(PLOTS / 'mount.svg', metadata={'Date': None})
-    plt.close(figure)
+    _save(figure, 'mount')
 
 
 def main() -> None:

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The true motion of a drive beside what cameras find: over its turns, and over all of it.
 
-    python benchmark/poses.py DRIVE POSES --camera NAME=FILE ... [--out DIR]
-                              [--windows N] [--no-turns]
+    python benchmark/poses.py [DRIVE POSES --camera NAME=FILE ...] [--data DIR] [--out DIR]
+                              [--results] [--windows N] [--no-turns]
 
 DRIVE: what dashcalib run reads; POSES: KITTI's format, one line for each frame; FILE: what
 dashcalib compare reads. A trivial guess (f is the width, the centre in the middle, no distortion)
-is always among them.
+and the drive's own result are always among them.
 
 Over the turns each scene of the calibration is adjusted anew with each camera held, as dashcalib
 check --poses does it. Over the whole drive, windows of WINDOW frames every STEP frames are tracked
@@ -18,13 +18,12 @@ each window, tables to DIR/poses.md, the plot of the whole drive to DIR/drive.sv
 """
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measure import commit, complain, load, save, table
+from measure import complain, keep_table, load, parser_with, save, table
 
 from dashcalib_ros import Calibrator, Config, open_frames
 from dashcalib_ros.camera import Camera
@@ -171,28 +170,30 @@ def drive_svg(found: Mapping[str, Mapping[str, Any]], true: np.ndarray) -> str:
 
 def main() -> None:
     """Measure."""
-    parser = argparse.ArgumentParser(description=__doc__,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('drive')
-    parser.add_argument('poses', type=Path)
+    parser = parser_with(__doc__, 'data')
+    parser.add_argument('drive', nargs='?', help="default: KITTI 03 in --data, with KITTI's K")
+    parser.add_argument('poses', nargs='?', type=Path)
     parser.add_argument('--camera', action='append', default=[], metavar='NAME=FILE')
-    parser.add_argument('--out', type=Path, default=Path('measured'))
     parser.add_argument('--windows', type=int, help='how many, at the most')
     parser.add_argument('--no-turns', action='store_true', help='only the whole drive')
     arguments = parser.parse_args()
-    config, poses = Config(), read_poses(arguments.poses)
-    given = dict(each.split('=', 1) for each in arguments.camera)
+    config, kitti = Config(), (arguments.data or Path('data')) / 'kitti03'
+    drive = arguments.drive or kitti / 'bag'
+    poses = read_poses(arguments.poses or kitti / 'poses.txt')
+    given = dict(each.split('=', 1) for each in arguments.camera) or {
+        "KITTI's K": str(kitti / 'truth.json')}
     cameras = {name: load_camera(path).camera for name, path in given.items()}
     cameras[GUESS] = trivial_guess(next(iter(cameras.values())).image_size)
     arguments.out.mkdir(parents=True, exist_ok=True)
     lines = []
     if not arguments.no_turns:
         with Calibrator(config) as calibrator:
-            for frame in open_frames(arguments.drive):
+            for frame in open_frames(drive):
                 calibrator.push(frame)
-            calibrator.calibrate()
+            found_camera = calibrator.calibrate().camera
             solution = calibrator.solution
-        assert solution is not None
+        assert solution is not None and found_camera is not None
+        cameras['ours'] = found_camera
         found = odometry(solution.scenes, cameras, poses, config)
         for name, text in path_files(found).items():
             (arguments.out / name).write_text(text)
@@ -204,11 +205,12 @@ def main() -> None:
              *(f'{unit * medians[key][name]:.2f}' for key, unit in (
                  ('rotation_deg', 1), ('rotation_deg_per_100m', 1), ('scale_drift', 100)))]
             for name in cameras]))
-    frames = list(open_frames(arguments.drive))
+    frames = list(open_frames(drive))
+    own = [name for name in cameras if name != GUESS]
     path = arguments.out / 'poses.json'
     known = load(path)
     windows(frames, cameras, config, known, path, arguments.windows)
-    drifts = {**chained(known, poses, list(given)), **chained(known, poses, [GUESS])}
+    drifts = {**chained(known, poses, own), **chained(known, poses, [GUESS])}
     lines.append(table(
         ['camera', 'windows', 'm', 'rotation off at the end °', '° in 100 m', 'RMS of a window °',
          'scale at the end %', 'scale spread %'],
@@ -217,10 +219,8 @@ def main() -> None:
             'scale_spread_percent'))] for name, row in drifts.items()]))
     # the guess leaves the plot
     (arguments.out / 'drive.svg').write_text(drive_svg(
-        {name: drifts[name] for name in given}, poses.positions))
-    text = f'At {commit()}.\n\n' + '\n\n'.join(lines) + '\n'
-    (arguments.out / 'poses.md').write_text(text)
-    print(text)
+        {name: drifts[name] for name in own}, poses.positions))
+    keep_table('poses', '\n\n'.join(lines), arguments)
 
 
 if __name__ == '__main__':

@@ -25,13 +25,13 @@ from measure import (
     complain,
     done,
     isolated,
+    keep_table,
     load,
     parser_with,
     reconstructed,
     save,
     table,
 )
-from result_tables import write_table
 
 from dashcalib_ros import Config, open_frames
 from dashcalib_ros.camera import Camera
@@ -212,10 +212,13 @@ def summary(rows: Mapping[str, Mapping[str, Any]]) -> str:
 
 def main() -> None:
     """Measure."""
-    arguments = parser_with(__doc__, 'data', 'seeds', 'out', 'results', 'again').parse_args()
+    arguments = parser_with(__doc__, 'data', 'seeds', 'drives', 'again',
+                            drives=[drive.name for drive in DRIVES]).parse_args()
     path = arguments.out / 'real.json'
     rows = load(path)
     for seed, drive in itertools.product(arguments.seeds, DRIVES):
+        if drive.name not in arguments.drives:
+            continue
         name = f'{drive.name}, seed {seed}'
         if done(rows.get(name)) and not arguments.again:
             continue
@@ -224,10 +227,7 @@ def main() -> None:
                       **(outcome.value or {'verdict': 'failed', 'reasons': [outcome.failure]})}
         save(path, rows)
         complain(f'{name}: {json.dumps(rows[name])[:300]}')
-    text = summary(rows)
-    print(text)
-    if arguments.results:
-        write_table('real', text, [row['commit'] for row in rows.values()])
+    keep_table('real', summary(rows), arguments, [row['commit'] for row in rows.values()])
 
 
 if __name__ == '__main__':

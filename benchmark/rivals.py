@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """dashcalib beside COLMAP's defaults and a trivial guess, on the same frames in the same run.
 
-    python benchmark/rivals.py [SETTING ...] [--rivals NAME ...] [--seeds 0] [--turns 5]
+    python benchmark/rivals.py [--drives SETTING ...] [--rivals NAME ...] [--seeds 0] [--turns 5]
         [--matcher sequential|exhaustive] [--whole] [--limit S] [--data DIR] [--cache DIR]
         [--out DIR] [--again] [--list]
 
@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import tempfile
 import time
 import zlib  # noqa: F401  before pycolmap
@@ -37,6 +36,7 @@ from measure import (
     error_cells,
     errors,
     isolated,
+    keep_table,
     load,
     parser_with,
     processor_s,
@@ -46,7 +46,6 @@ from measure import (
     summarised,
     table,
 )
-from result_tables import write_table
 
 from dashcalib_ros import Config, open_frames
 from dashcalib_ros.detect import Turn
@@ -257,11 +256,9 @@ def rivals_table(rows: Iterable[Mapping[str, Any]]) -> str:
 
 def main() -> None:
     """Run what is asked for."""
-    parser = parser_with(__doc__, 'data', 'cache', 'out', 'results', 'again')
-    parser.add_argument('settings', nargs='*', help=f'default: {OWN[0].name}')
+    parser = parser_with(__doc__, 'data', 'cache', 'seeds', 'drives', 'again', seeds=[0])
     parser.add_argument('--rivals', nargs='+', choices=list(RIVALS), metavar='NAME',
                         help=f'of {", ".join(RIVALS)}')
-    parser.add_argument('--seeds', nargs='+', type=int, default=[0])
     parser.add_argument('--turns', type=int, default=5)
     parser.add_argument('--matcher', choices=('sequential', 'exhaustive'), default='sequential')
     parser.add_argument('--whole', action='store_true', help='COLMAP on the whole drive, too')
@@ -271,7 +268,7 @@ def main() -> None:
     if arguments.list:
         print('\n'.join([*RENDERED, *RECORDED, '', *RIVALS]))
         return
-    settings = arguments.settings or [OWN[0].name]
+    settings = arguments.drives or [OWN[0].name, *(['kitti03'] if arguments.data else [])]
     for name in settings:
         if name not in RENDERED and (name not in RECORDED or arguments.data is None):
             raise SystemExit(f'no setting {name!r}; --list shows all (recorded ones need --data)')
@@ -295,11 +292,8 @@ def main() -> None:
                     save(path, rows)
                     print(rivals_table([rows[key]]).splitlines()[-1], flush=True)
     text = rivals_table(rows.values())
-    (arguments.out / 'rivals.md').write_text(
-        f'{os.cpu_count()} cores; s: from the turns\' frames to the result.\n\n{text}\n')
-    if arguments.results:
-        write_table('rivals', text, [row['commit'] for row in rows.values() if 'commit' in row])
-    print(f'\n{text}')
+    keep_table('rivals', f's: from the turns\' frames to the result.\n\n{text}', arguments,
+               [row['commit'] for row in rows.values()])
 
 
 def _task(name: str, seed: int, arguments: argparse.Namespace, passing: Path) -> Task:

@@ -1,14 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What takes the room of an environment: the size of each installed package, and what needs it.
+"""What takes the room of an environment: each installed package, and what needs it.
 
-Run it with the Python of an environment that has only this package:
+    python benchmark/size.py [--out DIR] [--results]
 
-    python3 -m venv light && . light/bin/activate && pip install .
-    python benchmark/size.py --results
+Makes an environment with only this package in DIR/light, by pip; one that is there is kept.
 """
 from __future__ import annotations
 
-import argparse
 import re
 import subprocess
 import sys
@@ -16,9 +14,10 @@ from collections import defaultdict
 from importlib.metadata import Distribution, distributions
 from pathlib import Path
 
-from result_tables import write_table
+from measure import keep_table, parser_with, table
 
 PACKAGE = 'dashcalib_ros'
+ROOT = Path(__file__).parents[1]
 # why a light use needs it, or what is lost without it
 REASONS = {
     'scipy': 'rotations, splines, sparse solvers: everywhere in the solution',
@@ -48,9 +47,20 @@ def sizes(package: Distribution) -> tuple[int, int]:
     return sum(size for _, size in found), sum(size for compiled, size in found if compiled)
 
 
-def table() -> str:
-    """Return the table of this environment: what is 2 MB or more, and the rest as one row."""
-    packages = {normal(each.name): each for each in distributions()}
+def environment(folder: Path) -> Path:
+    """Make an environment with this package alone; return where its packages are."""
+    if not folder.exists():
+        making = folder.with_name(f'{folder.name}.new')
+        subprocess.run([sys.executable, '-m', 'venv', '--clear', making], check=True)
+        subprocess.run([making / 'bin' / 'python', '-m', 'pip', 'install', '--quiet', ROOT],
+                       check=True)
+        making.rename(folder)
+    return next((folder / 'lib').glob('python3*/site-packages'))
+
+
+def packages_table(path: Path) -> str:
+    """Return the table of an environment: what is 2 MB or more, and the rest as one row."""
+    packages = {normal(each.name): each for each in distributions(path=[str(path)])}
     reasons = {normal(name): reason for name, reason in REASONS.items()}
     needed_by = defaultdict(set)
     for name, package in packages.items():
@@ -59,28 +69,22 @@ def table() -> str:
                 needed_by[normal(re.split(r'[^\w.-]', line)[0])].add(name)
     found = {name: sizes(package) for name, package in packages.items()}
     whole, compiled = (sum(column) for column in zip(*found.values(), strict=True))
-    rows = [f'| all | {whole / 1e6:.0f} | | {compiled / 1e6:.0f} MB of it is compiled Python, '
-            'of which `pip install --no-compile` makes only what is used |']
+    rows = [['all', f'{whole / 1e6:.0f}', '', f'{compiled / 1e6:.0f} MB of it is compiled Python, '
+             'of which `pip install --no-compile` makes only what is used']]
     large = sorted((name for name in found if found[name][0] >= 2e6),
                    key=lambda name: found[name], reverse=True)
     for name in large:
-        rows.append(f'| {name} | {found[name][0] / 1e6:.0f} | '
-                    f'{", ".join(sorted(needed_by[name]))} | {reasons.get(name, "")} |')
+        rows.append([name, f'{found[name][0] / 1e6:.0f}', ', '.join(sorted(needed_by[name])),
+                     reasons.get(name, '')])
     rest = sum(size for name, (size, _) in found.items() if name not in large)
-    rows.append(f'| {len(found) - len(large)} others | {rest / 1e6:.0f} | | |')
-    return '\n'.join(['| package | MB | required by | why |', '|---|---|---|---|', *rows])
+    rows.append([f'{len(found) - len(large)} others', f'{rest / 1e6:.0f}', '', ''])
+    return table(['package', 'MB', 'required by', 'why'], rows)
 
 
 def main() -> None:
     """Print the table, or write it."""
-    parser = argparse.ArgumentParser(description=__doc__,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--results', action='store_true', help='write benchmark/results/size.md')
-    if not parser.parse_args().results:
-        sys.exit(print(table()))
-    commit = subprocess.run(['git', 'describe', '--always', '--dirty', '--abbrev=7'], check=True,
-                            cwd=Path(__file__).parent, capture_output=True, text=True).stdout
-    print(write_table('size', table(), [commit.strip()]))
+    given = parser_with(__doc__).parse_args()
+    keep_table('size', packages_table(environment(given.out / 'light')), given)
 
 
 if __name__ == '__main__':

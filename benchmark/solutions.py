@@ -56,8 +56,8 @@ def solved_drive(name: str, seed: int, cache: Path, data: Path | None = None) ->
 
 
 def solution_path(name: str, seed: int, cache: Path) -> Path:
-    """Return where a drive's solution is kept."""
-    return cache / 'solutions' / f'{name}, seed {seed}.pickle'.replace('/', ' ')
+    """Return where a drive's solution by this commit is kept."""
+    return cache / 'solutions' / commit() / f'{name}, seed {seed}.pickle'.replace('/', ' ')
 
 
 def _frames_of(name: str, seed: int, cache: Path, data: Path | None

@@ -41,6 +41,7 @@ from measure import (
     commit,
     complain,
     isolated,
+    keep_table,
     load,
     memory_mb,
     parser_with,
@@ -51,7 +52,6 @@ from measure import (
     table,
     unit_s,
 )
-from result_tables import write_table
 
 from dashcalib_ros import Config
 from dashcalib_ros.detect import MotionEstimator, TurnDetector, estimator
@@ -311,7 +311,7 @@ def report(found: dict[str, Any]) -> str:
 
 def main() -> None:
     """Measure what is asked for."""
-    parser = parser_with(__doc__, 'data', 'cache', 'out', 'results')
+    parser = parser_with(__doc__, 'data', 'cache', 'again')
     parser.add_argument('parts', nargs='*', metavar='PART',
                         help=f'of {", ".join(PARTS)}; default: all')
     parser.add_argument('--minutes', type=float, default=60.0, help='of the long drive')
@@ -322,15 +322,13 @@ def main() -> None:
     found = load(path)
     with tempfile.TemporaryDirectory() as passing:
         for part in arguments.parts or PARTS:
+            if part in found and not arguments.again:
+                continue
             found |= {part: measure(part, arguments.minutes, arguments.cache or Path(passing),
                                     arguments.data),
-                      'cores': os.cpu_count(), 'commit': commit()}
+                      'commits': {**found.get('commits', {}), part: commit()}}
             save(path, found)
-    text = report(found)
-    (arguments.out / 'speed.md').write_text(f'{found["cores"]} cores.\n\n{text}\n')
-    if arguments.results:
-        write_table('speed', text, [found['commit']])
-    print(text)
+    keep_table('speed', report(found), arguments, found['commits'].values())
 
 
 if __name__ == '__main__':

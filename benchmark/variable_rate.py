@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Videos of a variable rate: the readout that is found, and the times of the turns.
 
-    python benchmark/variable_rate.py [--readouts 10 20 30] [--out DIR]
+    python benchmark/variable_rate.py [--readouts 10 20 30] [--out DIR] [--results]
 
 A rendered drive with a rolling shutter is filmed at 20, 15 and 8.3 Hz in stretches of 4 s, each
 step up to 20 % longer or shorter, and written as H.264 with B-frames. It is calibrated by the
@@ -11,7 +11,6 @@ halfway through the bend; those of the same drive at a steady 10 Hz are the leve
 """
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -20,6 +19,7 @@ import av
 import numpy as np
 import numpy.typing as npt
 from drives import BY_NAME, drive_of
+from measure import complain, keep_table, parser_with, table
 
 from dashcalib_ros import Config
 from dashcalib_ros.demo import Drive
@@ -60,24 +60,25 @@ def write(drive: Drive, times: Floats, path: Path) -> None:
         container.mux(stream.encode(None))
 
 
-def row(name: str, path: Path, fps: float | None, centres_s: Sequence[float]) -> str:
+def row(name: str, path: Path, fps: float | None, centres_s: Sequence[float]) -> list[str]:
     """Calibrate a video; return a line of the table."""
     found = calibrate(path, fps, Config(seed=0))
     shutter = found.rolling_shutter
     readout = f'{shutter.readout_ms:.1f} ± {shutter.sigma_ms:.1f}' if shutter else 'none'
     off = [min(abs(turn.stamp_s - centre) for turn in found.turns) for centre in centres_s]
-    return (f'| {name} | {found.verdict.level} | {readout} | {max(off):.2f} | '
-            f'{found.camera.fx if found.camera else float("nan"):.1f} |')
+    cells = [name, found.verdict.level, readout, f'{max(off):.2f}',
+             f'{found.camera.fx:.1f}' if found.camera else '']
+    complain(' '.join(cells))
+    return cells
 
 
 def main() -> None:
-    """Write the videos, and print a table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    """Write the videos, and a table."""
+    parser = parser_with(__doc__)
     parser.add_argument('--readouts', nargs='+', type=int, default=[10, 20, 30])
-    parser.add_argument('--out', type=Path, default=Path('measured'))
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
-    print('| video | verdict | readout, ms | turns off by, s | fx |\n|---|---|---|---|---|')
+    rows = []
     for readout in args.readouts:
         drive = drive_of(BY_NAME[f'rolling shutter {readout} ms'], 0)
         centres_s = [center / drive.spec.rate for center in drive.turn_centers]
@@ -87,9 +88,11 @@ def main() -> None:
                 write(drive, times, path.with_suffix('.part.mp4'))
                 path.with_suffix('.part.mp4').rename(path)
             name = f'{readout} ms, {kind.__name__} rate'
-            print(row(name, path, None, centres_s), flush=True)
+            rows.append(row(name, path, None, centres_s))
         mean = (len(times) - 1) / float(times[-1])
-        print(row(f'{name}, by its mean', path, mean, centres_s), flush=True)
+        rows.append(row(f'{name}, by its mean', path, mean, centres_s))
+    keep_table('variable_rate', table(
+        ['video', 'verdict', 'readout, ms', 'turns off by, s', 'fx'], rows), args)
 
 
 if __name__ == '__main__':

@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measure import commit, isolated, parser_with, table
-from result_tables import write_table
+from measure import isolated, keep_table, parser_with, table
 
 from dashcalib_ros import Config, calibrate
 
@@ -40,12 +39,10 @@ def piece(data: Path, name: str, start_s: float, seconds: float, stabiliser: str
 
 def main() -> None:
     """Calibrate all pieces and print the table."""
-    parser = parser_with(__doc__)
-    parser.add_argument('--data', type=Path, default=Path('../shared/data'))
+    parser = parser_with(__doc__, 'data', 'drives', drives=DRIVES)
+    parser.set_defaults(data=Path('data'))
     parser.add_argument('--seconds', type=float, default=10.0)
     parser.add_argument('--pieces', type=int, default=8, help='of each drive, at most')
-    parser.add_argument('--drives', nargs='+', default=list(DRIVES), choices=DRIVES)
-    parser.add_argument('--results', action='store_true')
     args = parser.parse_args()
     rows, off = [], {'': list[float](), 'no': list[float]()}
     for name in args.drives:
@@ -71,9 +68,7 @@ def main() -> None:
                  f'{np.sqrt(np.mean(np.square(errors))) if errors else np.nan:.2f} sigmas RMS, '
                  f'{sum(abs(error) > 2 for error in errors)} beyond 2, '
                  f'{sum(abs(error) > 3 for error in errors)} beyond 3.')
-    print(text)
-    if args.results:
-        write_table('without_turns', text, [commit()])
+    keep_table('without_turns', text, args)
 
 
 if __name__ == '__main__':

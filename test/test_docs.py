@@ -56,7 +56,7 @@ def test_the_files_that_contributors_are_sent_to_exist():
     text = (ROOT / 'CONTRIBUTING.md').read_text()
     for name in re.findall(r'`([a-z_]+\.py)`', text):
         assert any(any((ROOT / folder).rglob(name))
-                   for folder in ('test', 'dashcalib_ros', 'benchmark')), name
+                   for folder in ('test', 'testing', 'dashcalib_ros', 'benchmark')), name
 
 
 def test_the_newest_changes_are_on_top_with_their_date():
@@ -64,15 +64,6 @@ def test_the_newest_changes_are_on_top_with_their_date():
     assert headings[0] == '[Unreleased]'
     assert all(re.fullmatch(r'\[\d+\.\d+\.\d+\]( - \d{4}-\d\d-\d\d)?', each)
                for each in headings[1:])
-
-
-def test_each_figure_of_the_readme_names_its_commit():
-    figures = (ROOT / 'README.md').read_text().partition('\n## Figures')[2].partition('\n## ')[0]
-    rows = [line for line in figures.splitlines() if line.startswith('| ')][1:]
-    assert rows
-    for row in rows:
-        assert re.search(r'\| \[[0-9a-f]{7}(, [0-9a-f]{7})*\]'
-                         r'\((docs|benchmark/results)/\w+\.md[^)]*\) \|$', row), row
 
 
 def test_the_commits_of_figures_are_in_the_history():

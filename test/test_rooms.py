@@ -209,7 +209,7 @@ def test_a_result_and_its_report_need_no_scipy():
     # it takes half a second to load, and 27 MB and more, in each process
     code = """
 import sys, zlib
-sys.path.insert(0, 'test')
+sys.path[:0] = ['test', 'testing']
 import numpy as np
 from made_calibration import MOUNT, make_calibration
 from solving import CONFIG, scenes_of

@@ -18,8 +18,8 @@ MYPY = ['mypy'] if (ROOT / 'benchmark').is_dir() else ['mypy', 'dashcalib_ros']
 
 def test_every_source_file_names_its_licence():
     sources = [ROOT / 'setup.py', *(
-        path for folder in ('dashcalib_ros', 'test', 'benchmark', 'docs', 'examples', 'launch',
-                            'scripts', 'config')
+        path for folder in ('dashcalib_ros', 'test', 'testing', 'benchmark', 'docs', 'examples',
+                            'launch', 'scripts', 'config')
         for path in (ROOT / folder).rglob('*')
         if path.suffix in ('.py', '.sh', '.xml', '.rviz') or path.parent == ROOT / 'scripts')]
     assert len(sources) > 100

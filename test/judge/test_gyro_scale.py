@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from made_motion import town
+from towns import town
 
 from dashcalib_ros.input.motion import Samples
 from dashcalib_ros.judge.gyro_scale import scale_by_gps

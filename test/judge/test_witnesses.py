@@ -6,10 +6,10 @@ import dataclasses
 
 import numpy as np
 import pytest
-from made_motion import town
 from scipy.spatial.transform import Rotation
 from solving import CONFIG, YAWS, solved, with_camera
 from synthetic import LENS, synthetic_turn
+from towns import town
 
 from dashcalib_ros.config import VerdictConfig
 from dashcalib_ros.input.motion import Samples, SensorStream

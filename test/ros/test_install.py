@@ -324,7 +324,7 @@ def test_the_large_image_profile_carries_best_effort_images(tmp_path, node_and_b
     node, bench = node_and_bench
     camera = f"""
 import sys, time
-sys.path.insert(0, {str(REPOSITORY / 'test')!r})
+sys.path.insert(0, {str(REPOSITORY / 'testing')!r})
 import numpy as np, rclpy
 from ros_bench import START, Bench, image_message
 context = rclpy.Context()

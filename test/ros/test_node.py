@@ -45,7 +45,7 @@ from dashcalib_ros.formats import load_camera
 # publishes images until it is killed; the first one's number comes as an argument
 DRIVER = f"""
 import sys
-sys.path.insert(0, {str(REPOSITORY / 'test')!r})
+sys.path.insert(0, {str(REPOSITORY / 'testing')!r})
 import rclpy
 from ros_bench import Bench, SECOND, START, image_message, noise
 rclpy.init()

@@ -61,7 +61,7 @@ def ros_environment(home):
     return {
         'ROS_DOMAIN_ID': str(DOMAIN), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
         'ROS_PYTHON_CHECK_FIELDS': '1', 'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4',
-        **profiles(REPOSITORY / 'test' / 'fastdds_one_process.xml'),
+        **profiles(REPOSITORY / 'testing' / 'fastdds_one_process.xml'),
         'HOME': str(home), 'ROS_LOG_DIR': str(Path(home) / 'log'),
         'PYTHONPATH': os.pathsep.join([str(REPOSITORY), os.environ.get('PYTHONPATH', '')])}
 
