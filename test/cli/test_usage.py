@@ -105,7 +105,7 @@ def test_an_unknown_argument_names_the_help_of_its_command(here):
     (['rnu', 'x'], 'E-COMMAND-UNKNOWN', '`dashcalib run`'),
     (['exprot'], 'E-COMMAND-UNKNOWN', '`dashcalib export`'),
     # no drive, and like no command
-    (['camera.yaml'], 'E-COMMAND-UNKNOWN', 'run, turns, demo, compare, export, check, batch'),
+    (['camera.yaml'], 'E-COMMAND-UNKNOWN', 'run, turns, demo, compare, rig, export, check, batch'),
     (['run', 'x', '--fsp', '10'], 'E-ARGUMENT-UNKNOWN', 'did you mean --fps?'),
     (['run', 'x', '--thread=2'], 'E-ARGUMENT-UNKNOWN', 'did you mean --threads?'),
     (['run', 'x', '-fps', '2'], 'E-ARGUMENT-UNKNOWN', 'did you mean --fps?'),
