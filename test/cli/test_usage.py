@@ -186,7 +186,7 @@ def test_numpy_gets_one_thread_unless_more_are_asked_for(of, call, asked, thread
 
 
 @pytest.mark.parametrize(('line', 'expected'), [
-    ('dashcalib ', ['run', 'turns', 'demo', 'compare', 'export', 'check',
+    ('dashcalib ', ['run', 'turns', 'demo', 'compare', 'rig', 'export', 'check',
                     'batch']),
     ('dashcalib run --mod', ['--model']), ('dashcalib export x --to n', ['nerfstudio']),
     ('dashcalib demo --model f', ['fisheye'])])
