@@ -394,12 +394,12 @@ def _dotted(changes: Mapping[str, Any], known: Mapping[str, Any]) -> Iterator[tu
 def describe() -> Iterator[tuple[str, dataclasses.Field[Any]]]:
     """Yield (full name, field) of every setting, those for experts after the others.
 
-    Not those of FleetConfig: one drive, and the node, have no use for them. field.metadata has
-    reason, minimum, maximum, choices, pattern and expert.
+    Not those of FleetConfig and RigConfig: one camera, and the node, have no use for them.
+    field.metadata has reason, minimum, maximum, choices, pattern and expert.
     """
     for wanted in (False, True):
         for name, spec, _ in _settings(Config()):
-            if spec.metadata['expert'] is wanted and not name.startswith('fleet.'):
+            if spec.metadata['expert'] is wanted and not name.startswith(('fleet.', 'rig.')):
                 yield name, spec
 
 

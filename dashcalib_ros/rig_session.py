@@ -17,6 +17,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats, Mask
 from dashcalib_ros.camera import Camera
+from dashcalib_ros.camera.rotation import rotation_vectors
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import InputError, Notice
 from dashcalib_ros.input import Frame
@@ -40,6 +41,7 @@ from dashcalib_ros.rig.placed import (
 from dashcalib_ros.rig.start import Aligned, Metres, aligned, problem_of
 from dashcalib_ros.rig.witness import (
     Epipolar,
+    Fitted,
     fitted,
     matched,
     rays_of,
@@ -47,14 +49,14 @@ from dashcalib_ros.rig.witness import (
     sees_alike,
 )
 from dashcalib_ros.session import (
+    Calls,
     MotionOrPath,
     Observer,
     Recording,
     Settings,
-    _learned,
-    _Progress,
-    _settings,
+    learned_drive,
     open_drive,
+    settings_of,
     with_source,
 )
 from dashcalib_ros.solve.solution import Solution
@@ -133,7 +135,8 @@ def rig_of_drives(drives: Mapping[str, Recording], base: str | None = None,
     observer.show('placing the cameras', None)
     problem = problem_of(paths, base, kept, _metres(learned, base))
     best = solved(problem) if problem.pairs else None
-    calibrations = {name: each.calibration for name, each in learned.items()}
+    calibrations = {name: each.calibration if best is None else _refined(each, best, name)
+                    for name, each in learned.items()}
     levels = {name: each.calibration.verdict.level for name, each in learned.items()}
     metric = _metres(learned, base) is not None
     cameras: dict[str, PlacedCamera] = {}
@@ -156,7 +159,7 @@ def rig_of_drives(drives: Mapping[str, Recording], base: str | None = None,
 def _learn(name: str, drive: Recording, config: Config, observer: Observer) -> Learned:
     named = _Named(observer, name)
     try:
-        with _learned(drive, config, named, False) as calibrator:
+        with learned_drive(drive, config, named, False) as calibrator:
             calibration = with_source(calibrator.calibrate(named.show), drive.source)
             return _kept(drive, calibration, calibrator)
     except InputError as error:
@@ -288,7 +291,7 @@ def _witnessed(learned: Mapping[str, Learned], best: Solved,
     for (a, b), pairs in matches.items():
         if not pairs or not {a, b} <= best.problem.places.keys():
             continue
-        cameras = [_refined(learned[name], best, name) for name in (a, b)]
+        cameras = [_lens(learned[name], best, name) for name in (a, b)]
         rays, xy = rays_of(cameras, pairs, [learned[name].solution.field  # type: ignore[union-attr]
                                             for name in (a, b)])
         across = best.problem.places[b].rotation @ best.problem.places[a].rotation.T
@@ -298,14 +301,45 @@ def _witnessed(learned: Mapping[str, Learned], best: Solved,
             continue
         seen = residual_over(cameras[0], xy, held)
         found[a, b] = replace(seen, median=seen.median * scale, cells_rms=seen.cells_rms * scale)
+        free = fitted(rays, across, cameras[0].fx, free=True)
+        if free is not None and (degrees := _contradicted(free, across, best, a, b)):
+            for name in {a, b} - {best.problem.base}:
+                doubts[name] = (*doubts.get(name, ()), Notice(
+                    'E-RIG-EPIPOLAR', f'{name}: matches between {a} and {b} say that one is '
+                    f'turned by {degrees:.2f} degrees more against the other: check that none was '
+                    f'moved during the drive, or drive more turns'))
     return found, doubts
 
 
-def _refined(each: Learned, best: Solved, name: str) -> Camera:
-    """Return a camera's lens as the rig has it."""
+def _contradicted(free: Fitted, across: Floats, best: Solved, a: str, b: str) -> float:
+    """Return by how many degrees matches contradict a rotation; 0 where they do not."""
+    away = np.degrees(rotation_vectors((free.rotation @ across.T)[None])[0])
+    sigma = np.hypot(*(
+        np.degrees(best.sigma(name)[:3]) if name != best.problem.base else np.zeros(3)
+        for name in (a, b)))
+    sigma = np.hypot(sigma, np.degrees(np.sqrt(np.diag(free.covariance))))
+    beyond = np.abs(away) > np.maximum(CONTRADICTED * sigma, LEAST_APART_DEG)
+    return float(np.linalg.norm(away)) if beyond.any() else 0.0
+
+
+def _lens(each: Learned, best: Solved, name: str) -> Camera:
+    """Return a camera's lens as the rig has it, of the resized pictures."""
     assert each.solution is not None
     wide = each.solution.camera.widened()
     return wide.with_params(wide.params + best.problem.lenses[name][:-1])
+
+
+def _refined(each: Learned, best: Solved, name: str) -> Calibration:
+    """Return a camera's calibration with the lens that the rig's rotations go with."""
+    calibration, where = each.calibration, best.problem.where.get(('lens', name))
+    if calibration.camera is None or where is None:
+        return calibration
+    camera = _lens(each, best, name).resized(each.scale.px, calibration.image_size)
+    units = camera.units(each.scale.px)
+    covariance = best.covariance[where, where][:-1, :-1] * np.outer(units, units)
+    return replace(
+        calibration, camera=camera, covariance=covariance, picture_covariance=covariance,
+        sigma=dict(zip(camera.names(), np.sqrt(np.diag(covariance)).tolist(), strict=True)))
 
 
 def _metres(learned: Mapping[str, Learned], base: str) -> Metres | None:
@@ -327,20 +361,26 @@ def calibrate_rig(drives: Mapping[str, Paths | Recording], base: str | None = No
                   motion: MotionOrPath = None, progress: Progress | None = None) -> Rig:
     """Calibrate several cameras of one car from one drive, and where each sits.
 
-    drives: by the cameras' names: a video, a bag, a folder of images, as for calibrate();
-    PATH:TOPIC for one topic of a bag. Every camera may have its own size, rate, lens, shutter and
-    clock. base: the camera that the others are placed against; None: the first. fps, config: as
-    for calibrate(). motion: data of the car's sensors, on the clock of the base: with a speed
-    translations are in metres. progress: as for calibrate().
+    drives: by the cameras' names: a bag, a video, a folder of images, or several files of one
+    drive; 'BAG:TOPIC' for one topic of a bag. Every camera may have its own size, rate, lens,
+    shutter and clock.
+    base: the camera that the others are placed against; None: the first.
+    fps: images per second of a folder without times, or instead of a video's rate.
+    config: the settings: a Config, or a mapping such as {'turns.wanted': 8}; None: the defaults.
+    motion: data of the car's own sensors on the clock of the base: the path of a CSV, a GPX file
+    or a KITTI oxts folder, or a stream; with a speed translations are in metres.
+    progress: called with the name of a stage and its fraction done, 0 to 1; at last 'done', 1.0.
 
     Returns a Rig: its rig has a PlacedCamera for each name, with a verdict for each degree of
-    freedom, and its calibrations those of the cameras alone. Raises as calibrate() does.
+    freedom; its calibrations have each camera's lens as the whole rig shows it. Raises InputError
+    for input that cannot be read, ConfigError for a bad setting, WorkerError if a child process
+    cannot run.
     """
-    settings = _settings(config, None)
+    settings = settings_of(config, None)
     base = base or next(iter(drives), '')
     opened = {name: path if isinstance(path, Recording) else open_camera(
         path, fps, motion if name == base else None) for name, path in drives.items()}
-    with _Progress(progress) as observer:
+    with Calls(progress) as observer:
         return rig_of_drives(opened, base, settings, observer)
 
 

@@ -109,7 +109,7 @@ def calibrate_drive(drive: Recording, config: Config | None = None,
                     observer: Observer | None = None, verbose: bool = False) -> Calibration:
     """Calibrate a recorded drive; the input's name and warnings are in the result."""
     observer = observer or Observer()
-    with _learned(drive, config, observer, verbose) as calibrator:
+    with learned_drive(drive, config, observer, verbose) as calibrator:
         return with_source(calibrator.calibrate(observer.show), drive.source)
 
 
@@ -117,7 +117,7 @@ def outlook_of(drive: Recording, config: Config | None = None,
                observer: Observer | None = None) -> Outlook:
     """Find the turns of a recorded drive, and say whether they are enough for a calibration."""
     observer = observer or Observer()
-    with _learned(drive, config, observer, False) as calibrator:
+    with learned_drive(drive, config, observer, False) as calibrator:
         return calibrator.outlook(observer.show)
 
 
@@ -131,7 +131,7 @@ def check_drive(drive: Recording, named: NamedCamera, config: Config | None = No
     """
     observer = observer or Observer()
     given = drive.source.shown(named.camera)
-    with _learned(drive, config, observer, verbose) as calibrator:
+    with learned_drive(drive, config, observer, verbose) as calibrator:
         calibration = calibrator.calibrate(observer.show)
         check = calibrator.check(given, calibration, observer.show, named.name)
         if given.image_size != calibration.image_size:
@@ -170,7 +170,7 @@ def _is_calibration(given: Given) -> bool:
 
 
 @contextmanager
-def _learned(drive: Recording, config: Config | None, observer: Observer, verbose: bool
+def learned_drive(drive: Recording, config: Config | None, observer: Observer, verbose: bool
              ) -> Iterator[Calibrator]:
     """Give a calibrator that has taken every frame and what the sensors say."""
     calibrator = Calibrator(config, drive.mask, verbose)
@@ -299,17 +299,18 @@ def _in_colour(material: Material, source: FrameSource) -> Material:
 # for Python ---------------------------------------------------------------------------------
 
 
-class _Progress(Observer):
+class Calls(Observer):
     """Calls a function with each stage."""
 
     def __init__(self, progress: Progress | None) -> None:
         self._progress = progress
 
     def show(self, stage: str, share: float | None = None, note: str = '') -> None:
+        """Call the function."""
         if self._progress is not None:
             self._progress(stage, share or 0.0)
 
-    def __enter__(self) -> _Progress:
+    def __enter__(self) -> Calls:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
@@ -317,7 +318,8 @@ class _Progress(Observer):
             self.show('done', 1.0)
 
 
-def _settings(config: Settings, model: str | None) -> Config:
+def settings_of(config: Settings, model: str | None) -> Config:
+    """Return the settings, with another lens model. Raises ConfigError."""
     found = Config.of(config) if model is None else Config.of(config, model=model)
     searched(found.model)  # raises for an unknown model before any work begins
     return found
@@ -350,9 +352,9 @@ def calibrate(path: Paths, fps: float | None = None, config: Settings = None,
     None if it is refused; accepted() returns it, or raises. Raises InputError for input that
     cannot be read, ConfigError for a bad setting, WorkerError if a child process cannot run.
     """
-    settings = _settings(config, model)
+    settings = settings_of(config, model)
     drive = open_drive(path, topic, fps, start_s, duration_s, mask, motion, crop=crop)
-    with _Progress(progress) as observer:
+    with Calls(progress) as observer:
         return calibrate_drive(drive, settings, observer)
 
 
@@ -384,9 +386,9 @@ def check(given: Given, path: Paths, fps: float | None = None, config: Settings 
     'wrong' or 'cannot tell', with reasons. Raises InputError for what cannot be read, ConfigError
     for a bad setting, WorkerError where a child process cannot run.
     """
-    settings = _settings(config, model)
+    settings = settings_of(config, model)
     with in_order(given, path):
         drive = open_drive(path, topic, fps, start_s, duration_s, mask, motion, crop=crop)
         named = given_camera(given, drive.source.first_size)
-    with _Progress(progress) as observer:
+    with Calls(progress) as observer:
         return check_drive(drive, named, settings, observer).check

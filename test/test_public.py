@@ -39,12 +39,13 @@ from dashcalib_ros.errors import DashcalibError, InputError, NotAcceptedError
 from dashcalib_ros.formats import given_camera
 from dashcalib_ros.input.motion import SensorStream
 
-FUNCTIONS = ('calibrate', 'check', 'compare', 'export', 'load_camera', 'open_frames')
+FUNCTIONS = ('calibrate', 'calibrate_rig', 'check', 'compare', 'export', 'load_camera',
+             'load_rig', 'open_frames')
 ERRORS = ('ConfigError', 'DashcalibError', 'InputError', 'NotAcceptedError', 'OutputError',
           'WorkerError')
 NAMES = (*FUNCTIONS, *ERRORS, 'AcceptedCalibration', 'Calibration', 'Calibrator', 'Config',
          'Check', 'Comparison', 'NamedCamera', 'Frame', 'Camera', 'Radial', 'Brown', 'Fisheye',
-         'Rational', 'Verdict')
+         'Rational', 'RigCalibration', 'Verdict')
 # what mypy --strict accepts of a user
 SCRIPT = """
 from dashcalib_ros import calibrate

@@ -348,6 +348,7 @@ COMMANDS = {
         'dashcalib demo --lens fisheye --keep-bag --out demo', (
             ('--lens', {'choices': LENSES, 'metavar': 'KIND', 'default': LENSES[0],
                         'help': f'what is rendered: {", ".join(LENSES)} (default: {LENSES[0]})'}),
+            ('--rig', {**FLAG, 'help': 'render front, left and rear instead, and place them'}),
             MODEL, SEED, out_folder('demo'),
             ('--keep-bag', {**FLAG, 'help': 'keep the bag in DIR/bag'}), JSON, QUIET, VERBOSE),
         exit_codes=EXIT_HELP),
@@ -365,6 +366,25 @@ COMMANDS = {
             ('--rig', {**FLAG, 'help': 'A and B are two cameras of one car: show how B is '
                                        'mounted against A, and whether both saw one drive'}),
             JSON)),
+    'rig': Command(
+        'dashcalib_ros.cli.rig', 'calibrate several cameras of one car, and where each sits',
+        'Calibrates each camera, and how it is turned against the first one, where it sits and '
+        'how late its clock is: from one drive, without a board or a common view. Writes rig.json '
+        'to DIR, and the result of each camera to a folder of its name.',
+        'dashcalib rig front=front.mp4 left=left.mp4 rear=rear.mp4 --out rig', (
+            ('cameras', {'metavar': 'NAME=INPUT', 'nargs': '+',
+                         'help': f'a camera, and {INPUT_HELP}; BAG:TOPIC for one topic of a bag'}),
+            ('--base', {'metavar': 'NAME',
+                        'help': 'the camera that the others are placed against (default: the '
+                                'first)'}),
+            ('--fps', {'type': POSITIVE, 'metavar': 'F',
+                       'help': 'images per second of videos or image folders'}),
+            ('--motion', {'type': Path, 'metavar': 'FILE',
+                          'help': 'a speed of the car, on the clock of the base: translations are '
+                                  'in metres then; files as for run'}),
+            *SETTINGS, SEED, out_folder('rig', '; --json prints rig.json'), JSON, QUIET),
+        exit_codes='exit codes: 0 every camera is accepted; 3 one is weak or refused; 2 bad input '
+                   'or usage'),
     'export': Command(
         'dashcalib_ros.cli.cameras', "write a calibration as another program's camera file",
         'Prints the camera in the format of another program, or writes it to FILE.',

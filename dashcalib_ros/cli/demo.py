@@ -18,13 +18,23 @@ from rich.console import RenderableType
 from dashcalib_ros.arrays import plain_values
 from dashcalib_ros.camera import camera_of
 from dashcalib_ros.camera.mapping import Apart, apart_at, grid_of
-from dashcalib_ros.cli.arguments import exit_code
+from dashcalib_ros.cli.arguments import ACCEPTED, NOT_ENOUGH, exit_code
 from dashcalib_ros.cli.drive import read_config
+from dashcalib_ros.cli.rig import rig_lines, write_rig
 from dashcalib_ros.cli.run import files_line, now, warn_of
 from dashcalib_ros.cli.terminal import Screen, Stages
-from dashcalib_ros.demo import DEMOS, Drive, demo_drive, render_to_bag
+from dashcalib_ros.config import Config
+from dashcalib_ros.demo import (
+    DEMOS,
+    Drive,
+    demo_drive,
+    render_to_bag,
+    rig_drives,
+    true_places,
+)
 from dashcalib_ros.errors import OutputError
 from dashcalib_ros.formats import calibrated_camera, result_dict
+from dashcalib_ros.formats.rig import rig_json
 from dashcalib_ros.input.inputs import open_frames
 from dashcalib_ros.report import (
     Calibration,
@@ -37,6 +47,7 @@ from dashcalib_ros.report import (
 from dashcalib_ros.report.files import TRUTH
 from dashcalib_ros.report.tables import against_truth, conclusion, line, next_step, summary
 from dashcalib_ros.report.wording import optional
+from dashcalib_ros.rig_session import rig_of_drives
 from dashcalib_ros.session import Recording, calibrate_drive
 from dashcalib_ros.standard_streams import write_stdout
 from dashcalib_ros.whole_files import temporary_folder
@@ -49,6 +60,8 @@ def demo(args: argparse.Namespace) -> int:
     """Render, calibrate, compare with the truth; return the verdict's exit code."""
     started = perf_counter()
     config = read_config(args)
+    if args.rig:
+        return _rig(args, config, started)
     drive, about = demo_drive(config.seed, args.lens), DEMOS[args.lens].about
     screen = Screen(args.quiet, to_stderr=args.json)
     screen.show(line(f'rendered: {about}'))
@@ -83,6 +96,31 @@ def demo(args: argparse.Namespace) -> int:
         line(f'rendered and calibrated in {perf_counter() - started:.0f} s'),
         next_step(calibration.verdict))
     return exit_code(calibration.verdict.level)
+
+
+def _rig(args: argparse.Namespace, config: Config, started: float) -> int:
+    """Render several cameras of one car, place them, compare with the truth."""
+    drives = rig_drives(seed=config.seed)
+    base, screen = next(iter(drives)), Screen(args.quiet, to_stderr=args.json)
+    truth = {name: each.values for name, each in true_places(drives, base).items()}
+    with output_folder(args.out) as out:
+        with Stages(args.quiet) as stages, temporary_folder() as folder:
+            bags = {}
+            for name, drive in drives.items():
+                bags[name] = (out if args.keep_bag else folder) / f'bag-{name}'
+                stages.show(f'rendering {name}')
+                render_to_bag(drive, bags[name])
+            found = rig_of_drives({name: Recording(open_frames(bag))
+                                   for name, bag in bags.items()}, base, config, stages)
+        write_rig(found, out)
+        write_text(out / TRUTH, json.dumps({'base': base, 'cameras': truth}, allow_nan=False)
+                   + '\n')
+    if args.json:
+        write_stdout(rig_json(found.rig).rstrip('\n'))
+    screen.show(*(line(text) for text in rig_lines(found.rig.cameras)),
+                line(f'truth: {json.dumps(truth)}'),
+                line(f'rendered and calibrated in {perf_counter() - started:.0f} s'))
+    return ACCEPTED if found.rig.accepted else NOT_ENOUGH
 
 
 def truth_of(drive: Drive) -> dict[str, Any]:

@@ -35,7 +35,10 @@ def rig_json(rig: RigCalibration) -> str:
 
 
 def load_rig(path: str | os.PathLike[str]) -> RigCalibration:
-    """Read a rig.json, or the one in a folder. Raises InputError."""
+    """Read where the cameras of a car sit from path: a rig.json, or its folder.
+
+    Raises InputError for what is no rig.json.
+    """
     place = path_of(path)
     place = place / RIG if place.is_dir() else place
     data = parse_json(read_text(place, JSON_BYTES), str(place))

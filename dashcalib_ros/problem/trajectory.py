@@ -13,7 +13,6 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Ints, Mask
-from dashcalib_ros.camera.rotation import rotation_matrices
 
 # knots at the least, from which a spline says how the camera moved
 LEAST_KNOTS = 4
@@ -70,19 +69,27 @@ class Trajectory:
         """Return the same path, driven so much later."""
         return replace(self, seconds=self.seconds + seconds)
 
-    def at(self, seconds: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return the poses at times (n,): rotations (n, 3, 3), translations (n, 3), derivatives.
+    def at(self, seconds: Floats) -> tuple[Floats, Floats]:
+        """Return the poses at times (n,), rotations (n, 3, 3) and translations (n, 3).
 
-        These are (n, 6, k, 6) by the moves of the k knots; a move is a small rotation in a pose's
-        own axes, and one of its translation. The path must move.
+        The path must move.
+        """
+        near = np.abs(seconds[:, None] - self.seconds).argmin(axis=1)
+        weights = _weights(tuple(self.seconds.tolist()), seconds)
+        rotations = exponentials(np.einsum(
+            'nk,nkc->nc', weights, self._angles[near])) @ self.rotations[near]
+        return rotations, -np.einsum('nab,nb->na', rotations, weights @ self._centres)
+
+    def by_knots(self, seconds: Floats) -> Floats:
+        """Return (n, 6, k, 6) derivatives of the poses at times (n,) by the moves of the k knots.
+
+        A move is a small rotation in a pose's own axes, and one of its translation.
         """
         near = np.abs(seconds[:, None] - self.seconds).argmin(axis=1)
         weights, each = _weights(tuple(self.seconds.tolist()), seconds), np.arange(len(near))
         angles = self._angles[near]
         angle = np.einsum('nk,nkc->nc', weights, angles)
-        turned = rotation_matrices(angle)
-        rotations = turned @ self.rotations[near]
-        translations = -np.einsum('nab,nb->na', rotations, weights @ self._centres)
+        turned, (rotations, translations) = exponentials(angle), self.at(seconds)
         by_knots = np.zeros((len(near), 6, len(self.seconds), 6))
         crossed = cross(angles.reshape(-1, 3)).reshape(*weights.shape, 3, 3)
         by_turn = weights[:, :, None, None] * (np.eye(3) - crossed / 2 + crossed @ crossed / 12)
@@ -96,7 +103,7 @@ class Trajectory:
         shifted = np.concatenate([back @ cross(self.translations), back], axis=2)
         by_knots[:, 3:] = np.einsum('nab,nj,jbc->najc', rotations, weights, shifted)
         by_knots[:, 3:] -= np.einsum('nab,nbjc->najc', cross(translations), by_knots[:, :3])
-        return rotations, translations, by_knots
+        return by_knots
 
     def follow(self) -> Floats:
         """Return (count, 6, count, 6) derivatives of the keyframes' velocities by their moves."""
@@ -164,6 +171,13 @@ def cross(vectors: Floats) -> Floats:
     x, y, z = vectors.T
     zero = np.zeros_like(x)
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+
+
+def exponentials(vectors: Floats) -> Floats:
+    """Return (n, 3, 3) the rotations of vectors (n, 3), rad, all at once."""
+    angle = np.maximum(np.linalg.norm(vectors, axis=1), 1e-12)[:, None, None]
+    axis = cross(vectors / angle[:, :, 0])
+    return np.asarray(np.eye(3) + np.sin(angle) * axis + (1 - np.cos(angle)) * axis @ axis)
 
 
 def logarithms(rotations: Floats) -> Floats:

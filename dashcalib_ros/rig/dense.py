@@ -53,7 +53,7 @@ def retraced(frames: Sequence[Frame], scene: Scene, solution: Solution, config: 
         xy[seen] = solution.field.ideal(xy[seen])
         tracks = replace(tracks, xy=xy)
     first_ns = scene.tracks.stamps_ns[scene.structure.registered][0]
-    rotations, translations, _ = scene.trajectory.at((tracks.stamps_ns - first_ns) / 1e9)
+    rotations, translations = scene.trajectory.at((tracks.stamps_ns - first_ns) / 1e9)
     count = tracks.xy.shape[1]
     found = replace(scene, tracks=tracks, camera=solution.camera, structure=Structure(
         rotations, translations, np.zeros((count, 3)), np.ones(len(tracks.frames), bool),

@@ -36,13 +36,16 @@ PLACE, GAUGE = 8, 7
 # unit, where no speed is known. Of time: quartz clocks differ by less
 REACH_M, UNKNOWN_UNIT, PACE = 2.0, 0.7, 1e-4
 # steps of the problem; before some of them the noise is weighed anew
-STEPS, WEIGHED = 12, (3, 5, 7, 9)
+STEPS, WEIGHED = 12, (3, 6)
 # of steps, in sigmas; below it they end
 SETTLED = 0.02
 # s: noise between keyframes is that of knots so far apart, times the square of how far they are
 USUAL_GAP_S = 0.2
 # sigmas: a residual beyond it counts less
 OUTLIER = 3.5
+# of a lens's sigma: by how much each stretch may ask for a lens of its own. What all tracks of a
+# stretch share looks like another lens: on rendered rigs poses alone moved fx by 3 sigmas
+LENSES_DIFFER = 0.5
 # of numeric derivatives: rad, m, s, logarithms
 STEP = 1e-6
 
@@ -125,7 +128,7 @@ class Noise:
 
 # smallest and largest sizes, and the factors that are tried
 NOISES = (Noise(2e-5, 2e-4, 2e-5, 2e-4), Noise(2e-2, 0.3, 2e-2, 0.3))
-FACTORS = (0.3, 0.55, 0.8, 1.25, 1.8, 3.3)
+FACTORS = (4.0, 4.0, 2.0, 1.4)
 
 
 @dataclass(frozen=True)
@@ -148,7 +151,7 @@ class Rows:
     def whitened(self, noise: Noise) -> tuple[Floats, Floats, float]:
         """Return jacobian and off with unit noise, and the log of the noise's size."""
         root = np.linalg.cholesky(self.covariance(noise))
-        both = np.linalg.solve(root, np.column_stack([self.jacobian, self.off]))
+        both = np.linalg.inv(root) @ np.column_stack([self.jacobian, self.off])
         return both[:, :-1], both[:, -1], float(np.log(np.diag(root)).sum())
 
     def without_outliers(self, noise: Noise, step: Floats) -> Rows:
@@ -203,12 +206,11 @@ class Problem:
         own, its = self.places[pair.other[0]], self.places[pair.reference[0]]
         return its.on_own(own.on_base(self.scene(pair.other).seconds[pair.rows]))
 
-    def off(self, pair: Pair) -> tuple[Floats, Floats]:
-        """Return (r, 6) measured less predicted, and (r, 6, 6k) the prediction by the k knots."""
+    def off(self, pair: Pair) -> Floats:
+        """Return (r, 6) measured less predicted."""
         other, its = self.scene(pair.other), self.places[pair.reference[0]]
         own, gauge = self.places[pair.other[0]], pair.gauge
-        rotations, translations, by_knots = self.scene(pair.reference).trajectory.at(
-            self.when(pair))
+        rotations, translations = self.scene(pair.reference).trajectory.at(self.when(pair))
         across = own.rotation @ its.rotation.T
         lever = own.translation_m - across @ its.translation_m
         scale, unit = np.exp(gauge.log_scale), np.exp(self.units[pair.reference])
@@ -216,15 +218,21 @@ class Problem:
         shifted = turned @ gauge.shift
         there = (shifted + translations @ across.T + lever / unit) / scale
         measured = other.trajectory
-        off = np.concatenate([logarithms(
+        return np.concatenate([logarithms(
             measured.rotations[pair.rows] @ (turned @ gauge.rotation).transpose(0, 2, 1)),
             measured.translations[pair.rows] - there], axis=1)
-        follow = np.zeros((len(off), 6, 6))
+
+    def by_knots(self, pair: Pair) -> Floats:
+        """Return (r, 6, 6k) derivatives of what is predicted by the reference's k poses."""
+        its, own, gauge = self.places[pair.reference[0]], self.places[pair.other[0]], pair.gauge
+        path, when = self.scene(pair.reference).trajectory, self.when(pair)
+        across, scale = own.rotation @ its.rotation.T, np.exp(gauge.log_scale)
+        follow = np.zeros((len(when), 6, 6))
         follow[:, :3, :3] = across
-        follow[:, 3:, :3] = -cross(shifted) @ across / scale
+        follow[:, 3:, :3] = -cross(across @ path.at(when)[0] @ gauge.shift) @ across / scale
         follow[:, 3:, 3:] = across / scale
-        return off, np.asarray(np.einsum('rab,rbkc->rakc', follow, by_knots).reshape(
-            len(off), 6, -1))
+        return np.asarray(np.einsum('rab,rbkc->rakc', follow, path.by_knots(when)).reshape(
+            len(when), 6, -1))
 
     def moved_in(self, n: int, name: BlockKey, step: Floats) -> Floats:
         """Return (r, 6) the residuals of a pair after a step of one of its blocks."""
@@ -236,7 +244,7 @@ class Problem:
         else:
             key = pair.reference
             now = replace(self, units={**self.units, key: self.units[key] + float(step[0])})
-        return now.off(pair)[0]
+        return now.off(pair)
 
     def linearised(self, members: Sequence[int]) -> Rows:
         """Return the residuals of the pairs of one reference scene."""
@@ -246,7 +254,7 @@ class Problem:
         offs, jacobians, spreads, knots, owns = [], [], [], [], []
         for n in members:
             pair = self.pairs[n]
-            other, (off, by_knots) = self.scene(pair.other), self.off(pair)
+            other, off, by_knots = self.scene(pair.other), self.off(pair), self.by_knots(pair)
             jacobian = np.zeros((*off.shape, count))
             blocks: tuple[BlockKey, ...] = (
                 key[0], pair.other[0], ('unit', key), ('gauge', n))
@@ -268,14 +276,21 @@ class Problem:
             jacobians.append(jacobian.reshape(off.size, count))
             spreads.append(self._spread(pair))
             knots.append(by_knots.reshape(off.size, -1))
-            owns.append(other.covariance[np.ix_(rows, rows)])
+            owns.append(other.covariance[np.ix_(rows, rows)] + self._own_lens(
+                pair.other, other.follow[rows]))
         together = np.concatenate(knots)
-        known, at = together @ reference.covariance @ together.T, 0
+        known, at = (together @ reference.covariance @ together.T
+                     + self._own_lens(key, together @ reference.follow)), 0
         for own in owns:
             known[at:at + len(own), at:at + len(own)] += own
             at += len(own)
         return Rows(np.concatenate(offs), np.concatenate(jacobians), known,
                     np.concatenate(spreads, axis=1))
+
+    def _own_lens(self, key: SceneKey, follow: Floats) -> Floats:
+        """Return the covariance of poses by what a scene's lens differs from its camera's."""
+        return np.asarray(LENSES_DIFFER**2 * follow @ self.cameras[key[0]].lens_covariance
+                          @ follow.T)
 
     def _spread(self, pair: Pair) -> Floats:
         """Return (4, 6r) of which Noise's sizes are times."""
@@ -406,18 +421,15 @@ def _weighed(problem: Problem, groups: Sequence[Rows]) -> Noise:
     """Return the sizes of the noise that explain the residuals best."""
     best = _step(problem, groups)[2]
     sizes, least, most = problem.noise.sizes, *(each.sizes for each in NOISES)
-    for _ in range(3):
-        before = best
+    for factor in FACTORS:
         for place in range(len(sizes)):
-            for factor in FACTORS:
+            for times in (factor, 1 / factor):
                 tried = sizes.copy()
-                tried[place] = np.clip(factor * sizes[place], least[place], most[place])
+                tried[place] = np.clip(times * sizes[place], least[place], most[place])
                 badness = _step(replace(problem, noise=Noise(*tried.tolist())), groups)[2]
                 if badness < best:
-                    best, better = badness, tried
-                    sizes = better
-        if best == before:
-            break
+                    best, sizes = badness, tried
+                    break
     return Noise(*sizes.tolist())
 
 

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Mask
-from dashcalib_ros.camera.rotation import rotation_matrices, rotation_vectors
 from dashcalib_ros.problem.normal import linearised, poses_given_shared
 from dashcalib_ros.problem.steps import State
-from dashcalib_ros.problem.trajectory import Trajectory
+from dashcalib_ros.problem.trajectory import Trajectory, logarithms
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.rig.dense import imaging_of, loss_of
 from dashcalib_ros.solve.solution import Solution
@@ -53,21 +52,15 @@ class ScenePath:
         """Return whether times (n,) are between the first and the last keyframe."""
         return np.asarray((seconds >= self.seconds[0]) & (seconds <= self.seconds[-1]), bool)
 
-    def turned(self, seconds: Floats) -> Floats:
-        """Return (n - 1, 3) rad by which the camera turned between times (n,), in its own axes."""
-        return steps_between(self.trajectory.at(seconds)[0])
+    def steps(self, seconds: Floats) -> tuple[Floats, Floats]:
+        """Return (n - 1, 3) rad and (n - 1, 3) by which the camera turned and moved.
 
-    def ahead(self, seconds: Floats) -> Floats:
-        """Return (n - 1, 3) where the camera went between times (n,), in its axes halfway."""
-        rotations, translations, _ = self.trajectory.at(seconds)
+        From each of the times (n,) to the next, in the camera's axes at the first of both.
+        """
+        rotations, translations = self.trajectory.at(seconds)
         centres = -np.einsum('nji,nj->ni', rotations, translations)
-        halfway = rotation_matrices(steps_between(rotations) / 2) @ rotations[:-1]
-        return np.asarray(np.einsum('nij,nj->ni', halfway, np.diff(centres, axis=0)))
-
-
-def steps_between(rotations: Floats) -> Floats:
-    """Return (n - 1, 3) rad from each of n rotations, world to camera, to the next."""
-    return rotation_vectors(rotations[1:] @ rotations[:-1].transpose(0, 2, 1))
+        turned = logarithms(rotations[1:] @ rotations[:-1].transpose(0, 2, 1))
+        return turned, np.einsum('nij,nj->ni', rotations[:-1], np.diff(centres, axis=0))
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from dashcalib_ros.config import RigConfig
 from dashcalib_ros.errors import Notice
 from dashcalib_ros.judge.calibration import Level
 from dashcalib_ros.rig.joint import REACH_M, Solved
-from dashcalib_ros.rig.start import Aligned
+from dashcalib_ros.rig.start import LEAST_EXPLAINED, Aligned
 from dashcalib_ros.rig.witness import Epipolar
 
 Sight = Literal['accepted', 'weak', 'not visible']
@@ -111,6 +111,10 @@ def why_not_aligned(name: str, base: str, found: Aligned | None, scenes: int) ->
     if found is None or found.turned == 0.0:
         return Notice('E-RIG-NO-SHARED', f'{name} and {base} have no turn in common: check that '
                       f'both clips are of one drive, and drive two turns that both see')
+    if found.other_side and found.explained >= LEAST_EXPLAINED:
+        return Notice('E-RIG-OTHER-SIDE', f'{name} turns to the other side when {base} does: '
+                      f'check that both clips are of one drive, and turn pictures upright that '
+                      f'are upside down or mirrored')
     return Notice('E-RIG-OTHER-DRIVE', f'{name} does not turn when {base} does: at best '
                   f'{max(100 * found.explained, 0):.0f} % of its turning is explained: check that '
                   f'both clips are of one drive and one car')
@@ -170,16 +174,14 @@ def _reasons(name: str, visible: Visible, stretches: int, level: Level, apart: M
     if apart[:3].any():
         found.append(Notice('E-RIG-DISAGREE', f'{name}: the stretches differ by more than their '
                             f'sigmas: check that the camera was not moved during the drive'))
-    for part, sights, cure in (
-            ('rotation', visible.rotation, 'drive more turns, to the left and to the right'),
-            ('translation', visible.translation, 'a ramp or a kerb shows the height between two '
-             'cameras, turns show the rest, with --motion for metres')):
-        lacking = [axis for axis, sight in zip(AXES, sights, strict=True)
-                   if sight == 'not visible']
-        if lacking:
-            found.append(Notice(
-                f'E-RIG-{part.upper()}', f'{name}: its {part} along {", ".join(lacking)} is not '
-                f'visible on this drive: {cure}'))
+    if lacking := _lacking(visible.rotation):
+        found.append(Notice('E-RIG-ROTATION', f'{name}: its rotation about {lacking} is not '
+                            f'visible on this drive: drive more turns, to the left and to the '
+                            f'right'))
+    if lacking := _lacking(visible.translation):
+        found.append(Notice('E-RIG-TRANSLATION', f'{name}: its translation along {lacking} is not '
+                            f'visible on this drive: a ramp or a kerb shows the height between '
+                            f'two cameras, turns show the rest'))
     if not metric:
         found.append(Notice('E-RIG-NO-METRES', f'{name}: no metres are known, so it has no '
                             f'translation: add a speed (--motion)'))
@@ -187,3 +189,9 @@ def _reasons(name: str, visible: Visible, stretches: int, level: Level, apart: M
         found.append(Notice('E-RIG-CLOCK', f'{name}: its clock is known to {sigma[6]:.3f} s only: '
                             f'drive sharper turns'))
     return tuple(found)
+
+
+def _lacking(sights: Sights) -> str:
+    """Return the axes along which nothing is visible."""
+    return ', '.join(axis for axis, sight in zip(AXES, sights, strict=True)
+                     if sight == 'not visible')

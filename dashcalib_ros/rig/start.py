@@ -17,7 +17,7 @@ from dashcalib_ros.rig.joint import UNKNOWN_UNIT, Gauge, Pair, Place, Problem, S
 from dashcalib_ros.rig.paths import CameraPaths, ScenePath
 
 # s between the offsets that are tried, first and then
-COARSE_S, FINE_S = 0.1, 0.01
+COARSE_S, FINER_S = 0.2, (0.05, 0.01)
 # of the squared turning in two scenes; cameras that share less do not turn alike
 LEAST_EXPLAINED = 0.8
 # radians that both turned together, at the least; and what the score of a wrong offset may reach
@@ -57,7 +57,13 @@ class Aligned:
     @property
     def found(self) -> bool:
         """Return whether both cameras turn alike."""
-        return self.explained >= LEAST_EXPLAINED and self.turned >= LEAST_TURNED
+        return (self.explained >= LEAST_EXPLAINED and self.turned >= LEAST_TURNED
+                and not self.other_side)
+
+    @property
+    def other_side(self) -> bool:
+        """Return whether one turns to the other side: that, or it is upside down."""
+        return bool(self.rotation[1, 1] < 0)
 
 
 def aligned(camera: CameraPaths, base: CameraPaths, near_s: float | None = None
@@ -83,8 +89,11 @@ def aligned(camera: CameraPaths, base: CameraPaths, near_s: float | None = None
         if close.any() and scores[close].max() > RIVAL * scores.max():
             best = tried[close][int(np.argmax(scores[close]))]
     others = scores[np.abs(tried - best) > APART_S]
-    fine = best + np.arange(-COARSE_S, COARSE_S + FINE_S, FINE_S)
-    late = float(max(fine, key=lambda each: _score(camera, base, each)[0]))
+    late, width = float(best), COARSE_S
+    for step in FINER_S:
+        late = float(max(late + np.arange(-width, width + step / 2, step),
+                         key=lambda each: _score(camera, base, each)[0]))
+        width = step
     score, rotation, explained, turned = _score(camera, base, late)
     return Aligned(late, rotation, explained, turned,
                    max(float(others.max(initial=0.0)), 0.0) / max(score, 1e-12))
@@ -103,19 +112,21 @@ def _score(camera: CameraPaths, base: CameraPaths, late: float
         for its in base.scenes:
             seconds = _shared(own, its, late)
             if len(seconds) >= LEAST_SHARED:
-                turns.append(own.turned(seconds))
-                theirs.append(its.turned(seconds - late))
-                ways.append(_unit(own.ahead(seconds)))
-                their_ways.append(_unit(its.ahead(seconds - late)))
+                (turn, way), (its_turn, its_way) = own.steps(seconds), its.steps(
+                    seconds - late)
+                turns.append(turn)
+                theirs.append(its_turn)
+                ways.append(_unit(way))
+                their_ways.append(_unit(its_way))
     if not turns:
         return 0.0, np.eye(3), 0.0, 0.0
-    turn, its_turn = np.concatenate(turns), np.concatenate(theirs)
-    both = turn.T @ its_turn + DIRECTION**2 * (
+    all_turns, its_turns = np.concatenate(turns), np.concatenate(theirs)
+    both = all_turns.T @ its_turns + DIRECTION**2 * (
         np.concatenate(ways).T @ np.concatenate(their_ways))
     u, _, v = np.linalg.svd(both)
     rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ v))]) @ v
-    energy = float(np.sum(turn**2) + np.sum(its_turn**2)) / 2
-    left = float(np.sum((turn - its_turn @ rotation.T)**2))
+    energy = float(np.sum(all_turns**2) + np.sum(its_turns**2)) / 2
+    left = float(np.sum((all_turns - its_turns @ rotation.T)**2))
     explained = 1 - left / max(energy, 1e-12)
     turned = float(sum(np.linalg.norm(each.sum(axis=0)) for each in turns))
     return energy - left / (1 - LEAST_EXPLAINED), rotation, explained, turned
@@ -161,7 +172,7 @@ def _pair(cameras: Mapping[str, CameraPaths], places: Mapping[str, Place], refer
     rows = np.flatnonzero(its.within(when))
     if len(rows) < LEAST_SHARED:
         return None
-    rotations, translations, _ = its.trajectory.at(when[rows])
+    rotations, translations = its.trajectory.at(when[rows])
     centres = -np.einsum('nji,nj->ni', rotations, translations)
     across = place.rotation @ places[reference[0]].rotation.T
     turned = np.sum((across @ rotations).transpose(0, 2, 1)
@@ -183,7 +194,7 @@ def _unit_of(scene: ScenePath, speed: Metres | None) -> tuple[float, float]:
     ways, between = np.linalg.norm(np.diff(scene.centres, axis=0), axis=1), np.diff(scene.seconds)
     if speed is not None:
         metres = speed(scene.seconds[:-1] + between / 2) * between
-        bend = np.linalg.norm(scene.turned(scene.seconds), axis=1) / np.maximum(ways, 1e-12)
+        bend = np.linalg.norm(scene.steps(scene.seconds)[0], axis=1) / np.maximum(ways, 1e-12)
         kept = (bend < UNBENT * bend.max()) & (metres > 0)
         sigma = SPEED_SIGMA if kept.sum() >= LEAST_SHARED else BENT_SIGMA
         kept = kept if kept.sum() >= LEAST_SHARED else metres > 0

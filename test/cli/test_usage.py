@@ -105,7 +105,7 @@ def test_an_unknown_argument_names_the_help_of_its_command(here):
     (['rnu', 'x'], 'E-COMMAND-UNKNOWN', '`dashcalib run`'),
     (['exprot'], 'E-COMMAND-UNKNOWN', '`dashcalib export`'),
     # no drive, and like no command
-    (['camera.yaml'], 'E-COMMAND-UNKNOWN', 'run, turns, demo, compare, export, check, batch'),
+    (['camera.yaml'], 'E-COMMAND-UNKNOWN', 'run, turns, demo, compare, rig, export, check, batch'),
     (['run', 'x', '--fsp', '10'], 'E-ARGUMENT-UNKNOWN', 'did you mean --fps?'),
     (['run', 'x', '--thread=2'], 'E-ARGUMENT-UNKNOWN', 'did you mean --threads?'),
     (['run', 'x', '-fps', '2'], 'E-ARGUMENT-UNKNOWN', 'did you mean --fps?'),
@@ -186,7 +186,7 @@ def test_numpy_gets_one_thread_unless_more_are_asked_for(of, call, asked, thread
 
 
 @pytest.mark.parametrize(('line', 'expected'), [
-    ('dashcalib ', ['run', 'turns', 'demo', 'compare', 'export', 'check',
+    ('dashcalib ', ['run', 'turns', 'demo', 'compare', 'rig', 'export', 'check',
                     'batch']),
     ('dashcalib run --mod', ['--model']), ('dashcalib export x --to n', ['nerfstudio']),
     ('dashcalib demo --model f', ['fisheye'])])

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""dashcalib rig: several cameras of one car, and where each sits."""
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+
+from dashcalib_ros.cli.arguments import ACCEPTED, NOT_ENOUGH, UsageError
+from dashcalib_ros.cli.drive import read_config
+from dashcalib_ros.cli.run import now
+from dashcalib_ros.cli.terminal import Screen, Stages, warn
+from dashcalib_ros.formats.rig import RIG, rig_json
+from dashcalib_ros.report import output_folder, write_results, write_text
+from dashcalib_ros.report.tables import line
+from dashcalib_ros.rig.placed import PlacedCamera
+from dashcalib_ros.rig_session import Rig, open_camera, rig_of_drives
+from dashcalib_ros.standard_streams import write_stdout
+
+
+def rig(args: argparse.Namespace) -> int:
+    """Place the cameras, write rig.json and their results; return the exit code."""
+    config, inputs = read_config(args), named(args.cameras)
+    base = args.base or next(iter(inputs))
+    drives = {name: open_camera(path, args.fps, args.motion if name == base else None)
+              for name, path in inputs.items()}
+    screen = Screen(args.quiet, to_stderr=args.json)
+    with output_folder(args.out):
+        with Stages(args.quiet) as stages:
+            found = rig_of_drives(drives, base, config, stages)
+        write_rig(found, args.out)
+    warn((*found.rig.warnings, *(
+        reason for camera in found.rig.cameras.values() for reason in camera.reasons)))
+    if args.json:
+        write_stdout(rig_json(found.rig).rstrip('\n'))
+    screen.show(*(line(text) for text in rig_lines(found.rig.cameras)),
+                *(line(f'{a} and {b} see the same: {each.matches} matches, epipolar residual '
+                       f'{each.median:.2f} px, over the picture {each.cells_rms:.2f} px RMS')
+                  for (a, b), each in found.rig.witness.items()),
+                line(f'written to {args.out}: {RIG}, and a folder for each camera'))
+    return ACCEPTED if found.rig.accepted else NOT_ENOUGH
+
+
+def named(cameras: list[str]) -> dict[str, str]:
+    """Return the inputs by the cameras' names. Raises UsageError."""
+    found: dict[str, str] = {}
+    for each in cameras:
+        name, equals, path = each.partition('=')
+        if not equals or not path or not name.replace('-', '_').isidentifier():
+            raise UsageError('E-RIG-ARGUMENT', f'{each!r} is not like front=front.mp4')
+        if name in found:
+            raise UsageError('E-RIG-NAME-TWICE', f'two cameras are called {name}: give each a '
+                                                 f'name of its own')
+        found[name] = path
+    return found
+
+
+def write_rig(found: Rig, out: Path) -> None:
+    """Write rig.json, and the results of each camera in a folder of its name."""
+    for name, calibration in found.calibrations.items():
+        write_results(calibration, out / name, created=now())
+    write_text(out / RIG, rig_json(found.rig))
+
+
+def rig_lines(cameras: Mapping[str, PlacedCamera]) -> list[str]:
+    """Return a line for each camera: its verdict, its place, and the sigmas."""
+    found = []
+    for name, camera in cameras.items():
+        text = f'{name}: {camera.verdict}'
+        if camera.rotation_deg is not None and camera.rotation_sigma_deg is not None:
+            text += f', rotation {_values(camera.rotation_deg, camera.rotation_sigma_deg, 2)}°'
+        if camera.translation_m is not None and camera.translation_sigma_m is not None:
+            text += (f', translation '
+                     f'{_values(camera.translation_m, camera.translation_sigma_m, 3)} m')
+        if camera.time_offset_s is not None and camera.time_sigma_s is not None:
+            text += (f', clock {1e3 * camera.time_offset_s:.1f} ± '
+                     f'{1e3 * camera.time_sigma_s:.1f} ms')
+        found.append(text)
+    return found
+
+
+def _values(values: tuple[float, ...], sigmas: tuple[float, ...], digits: int) -> str:
+    return '(' + ', '.join(f'{value:.{digits}f} ± {sigma:.{digits}f}' for value, sigma in zip(
+        values, sigmas, strict=True)) + ')'

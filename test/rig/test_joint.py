@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rigs of made paths: exact truth, noise, lenses that are off, clocks of their own."""
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_rig import SPEED, Mounted, made_paths
+
+from dashcalib_ros.camera.rotation import rotation_matrices, rotation_vectors
+from dashcalib_ros.config import RigConfig
+from dashcalib_ros.rig.joint import Solved, solved
+from dashcalib_ros.rig.paths import CameraPaths
+from dashcalib_ros.rig.placed import placed, why_not_aligned
+from dashcalib_ros.rig.start import aligned, problem_of
+
+CAMERAS = {
+    'front': Mounted(step_s=0.25),
+    'rear': Mounted((2.0, 177.5, 1.5), (0.3, -0.2, -2.0), 3.35, 0.25, 0.06),
+    'left': Mounted((3.0, 75.0, -2.0), (-0.5, 0.1, 1.0), -0.02, 0.25, 0.02)}
+
+
+def speed(seconds):
+    return np.full(len(seconds), SPEED)
+
+
+def rig_of(names=('front', 'rear'), metres=speed, **options) -> tuple[Solved, dict]:
+    cameras = {name: CAMERAS[name] for name in names}
+    paths, _ = made_paths(cameras, **options)
+    found = {name: aligned(paths[name], paths['front']) for name in names[1:]}
+    assert all(each is not None and each.found for each in found.values())
+    return solved(problem_of(paths, 'front', found, metres)), cameras
+
+
+def errors(best: Solved, name: str) -> np.ndarray:
+    """Return (7,) how far a camera's place is off: rad, m, s."""
+    place, truth = best.problem.places[name], CAMERAS[name]
+    return np.r_[rotation_vectors((place.rotation @ truth.rotation.T)[None])[0],
+                 place.translation_m - truth.translation_m, place.late_s - truth.late_s]
+
+
+def test_places_are_found_to_within_their_sigmas():
+    off = []
+    for seed in range(4):
+        best, _ = rig_of(yaws=(85.0, -75.0), seed=seed)
+        off.append(errors(best, 'rear') / best.sigma('rear')[:7])
+        assert np.degrees(best.sigma('rear')[:3]).max() < 0.25
+        assert abs(errors(best, 'rear')[6]) < 1e-3
+    off = np.array(off)
+    assert np.mean(np.abs(off) < 2) > 0.85 and np.abs(off).max() < 3.5
+    # and they are not much too large
+    assert np.sqrt(np.mean(off**2)) > 0.3
+
+
+def test_known_lenses_make_a_sharp_rig():
+    best, _ = rig_of(('front', 'rear', 'left'), yaws=(85.0, -75.0), lens_sigma=0.01)
+    for name in ('rear', 'left'):
+        assert np.degrees(best.sigma(name)[:3]).max() < 0.04
+        assert np.abs(np.degrees(errors(best, name)[:3])).max() < 0.06
+        assert np.abs(errors(best, name)[[3, 5]]).max() < 0.03
+
+
+def test_a_rotation_about_the_vertical_is_known_no_better_than_the_lenses():
+    sharp, _ = rig_of(yaws=(85.0, -75.0), lens_sigma=0.01)
+    dull, _ = rig_of(yaws=(85.0, -75.0), lens_sigma=1.0)
+    # each lens is off by 0.1 degrees
+    assert np.degrees(dull.sigma('rear')[1]) > 0.1 > 2 * np.degrees(sharp.sigma('rear')[1])
+
+
+def test_a_flat_road_shows_no_height_and_no_metres_without_a_speed():
+    best, _ = rig_of(yaws=(85.0, -75.0))
+    assert best.sigma('rear')[4] > 3 * best.sigma('rear')[[3, 5]].max()
+    found = placed('rear', 'rear/result.json', 'accepted', best, True, 0.0, RigConfig())
+    assert found.visible.rotation == ('accepted',) * 3 and found.verdict == 'accepted'
+    assert found.translation_m is not None and abs(found.translation_m[2] + 2.0) < 0.05
+    best, _ = rig_of(yaws=(85.0, -75.0), metres=None)
+    found = placed('rear', 'rear/result.json', 'accepted', best, False, 0.0, RigConfig())
+    assert found.translation_m is None and found.verdict == 'accepted'
+    assert 'E-RIG-NO-METRES' in [reason.code for reason in found.reasons]
+
+
+def test_one_stretch_or_a_refused_lens_is_weak():
+    best, _ = rig_of(yaws=(85.0,))
+    found = placed('rear', '', 'accepted', best, True, 0.0, RigConfig())
+    assert found.verdict == 'weak'
+    assert 'E-RIG-ONE-STRETCH' in [reason.code for reason in found.reasons]
+    best, _ = rig_of(yaws=(85.0, -75.0))
+    found = placed('rear', '', 'refused', best, True, 0.0, RigConfig())
+    assert found.verdict == 'weak' and found.rotation_deg is not None
+    assert [reason.code for reason in found.reasons] == ['E-RIG-LENS']
+
+
+def test_a_camera_that_was_moved_between_two_turns_is_not_accepted():
+    paths, _ = made_paths({name: CAMERAS[name] for name in ('front', 'rear')},
+                          yaws=(85.0, -75.0), lens_sigma=0.1)
+    moved = paths['rear'].scenes[1]
+    turned = rotation_matrices(np.radians([[0.0, 0.0, 1.0]]))[0]
+    trajectory = replace(moved.trajectory, rotations=turned @ moved.trajectory.rotations,
+                         translations=moved.trajectory.translations @ turned.T)
+    paths['rear'] = replace(paths['rear'], scenes=(
+        paths['rear'].scenes[0], replace(moved, trajectory=trajectory)))
+    found = {'rear': aligned(paths['rear'], paths['front'])}
+    best = solved(problem_of(paths, 'front', found, speed))
+    result = placed('rear', '', 'accepted', best, True, 0.0, RigConfig())
+    assert result.verdict != 'accepted'
+    assert 'E-RIG-DISAGREE' in [reason.code for reason in result.reasons]
+
+
+def test_a_clip_of_another_drive_does_not_turn_alike():
+    front, _ = made_paths({'front': CAMERAS['front']}, yaws=(85.0, -75.0))
+    other, _ = made_paths({'rear': CAMERAS['rear']}, yaws=(25.0, 30.0, 28.0), seed=3)
+    found = aligned(other['rear'], front['front'])
+    assert found is None or not found.found
+    assert why_not_aligned('rear', 'front', found, 3).code in (
+        'E-RIG-OTHER-DRIVE', 'E-RIG-NO-SHARED')
+    assert aligned(CameraPaths('rear', (), np.zeros((0, 0))), front['front']) is None
+    assert why_not_aligned('rear', 'front', None, 0).code == 'E-RIG-NO-SCENES'
+
+
+@pytest.mark.parametrize('late_s', [-12.0, 0.0, 7.31])
+def test_clocks_are_found_wherever_videos_start(late_s):
+    cameras = {'front': CAMERAS['front'], 'left': replace(CAMERAS['left'], late_s=late_s)}
+    paths, _ = made_paths(cameras, yaws=(85.0, -75.0, 60.0))
+    found = aligned(paths['left'], paths['front'])
+    assert found is not None and found.found and abs(found.late_s - late_s) < 0.03
+
+
+def test_a_turn_to_the_other_side_is_another_drive():
+    # an upright camera cannot see the car turn to the other side
+    front, _ = made_paths({'front': CAMERAS['front']}, yaws=(85.0, -75.0, 60.0))
+    left, _ = made_paths({'left': CAMERAS['left']}, yaws=(-85.0, 75.0, -60.0))
+    found = aligned(left['left'], front['front'])
+    assert found is not None and found.other_side and not found.found
+    assert why_not_aligned('left', 'front', found, 3).code == 'E-RIG-OTHER-SIDE'
