@@ -33,13 +33,15 @@ def pytest_configure(config):
 
 
 # the files that take longest, the longest first: begun last, each would keep one core alone
-LONG_FILES = ('test_node.py', 'test_calibrator.py', 'test_drive.py', 'test_child.py',
-              'test_run.py', 'test_judging.py', 'test_pool.py', 'test_docs_commands.py',
-              'test_around.py', 'test_solve.py', 'test_learner.py', 'test_usage.py',
-              'test_engine.py', 'test_example.py', 'test_choice.py', 'test_style.py',
-              'test_segmentation.py', 'test_field.py', 'test_fixed_camera.py', 'test_install.py',
-              'test_witnesses.py', 'test_export.py', 'test_pipeline.py', 'test_shutter.py',
-              'test_preview.py')
+LONG_FILES = ('test_node.py', 'test_pipeline.py', 'test_solve.py', 'test_drive.py',
+              'test_style.py', 'test_run.py', 'test_docs_commands.py', 'test_witnesses.py',
+              'test_example.py', 'test_around.py', 'test_packaging.py', 'test_fuse.py',
+              'test_rig.py', 'test_batch.py', 'test_fixed_camera.py', 'test_session.py',
+              'test_choice.py', 'test_child.py', 'test_lifecycle.py', 'test_field.py',
+              'test_shutter.py', 'test_drift.py', 'test_known.py', 'test_one_camera.py',
+              'test_judging.py', 'test_earlier.py', 'test_causes.py', 'test_pool.py',
+              'test_install.py', 'test_segmentation.py', 'test_play.py', 'test_usage.py',
+              'test_learner.py', 'test_odd_bags.py', 'test_lens_prior.py', 'test_export.py')
 
 
 def pytest_collection_modifyitems(items):
@@ -56,6 +58,13 @@ def shared_drive(tmp_path_factory):
     if 'PYTEST_XDIST_WORKER' in os.environ:
         folder = folder.parent
     return SharedDrive(folder / 'shared_drive.npy')
+
+
+@pytest.fixture(scope='session')
+def shared_calibration(shared_drive):
+    """What comes of the shared drive with QUICK; it is calibrated once in a run."""
+    from shared_drive import shared_calibration
+    return shared_calibration(shared_drive)
 
 
 @pytest.fixture(scope='module')

@@ -208,11 +208,12 @@ def options_exist(words):
 def starts_and_stops(tmp_path):
     """Start the node with a command's arguments, as `ros2 run` would, and stop it."""
     pytest.importorskip('rclpy', reason='no ROS on this machine: pip install the ros extra')
-    from ros_bench import COMMAND, SOON, NodeProcess
+    from ros_bench import QUICK_COMMAND, SOON, NodeProcess
 
     def start(arguments):
         at = arguments.index('--ros-args') if '--ros-args' in arguments else len(arguments)
-        node = NodeProcess(tmp_path, *arguments[at + 1:], command=[*COMMAND, *arguments[:at]])
+        node = NodeProcess(tmp_path, *arguments[at + 1:],
+                           command=[*QUICK_COMMAND, *arguments[:at]])
         try:
             if '--help' in arguments:
                 assert node.process.wait(SOON) == 0 and 'usage' in node.text.lower()

@@ -81,8 +81,8 @@ def calibrated(frames: Iterable[Frame], config: Config = QUICK, **options) -> Ca
 
 
 @pytest.fixture(scope='session')
-def result(frames) -> Calibration:
-    return calibrated(frames)
+def result(shared_calibration) -> Calibration:
+    return shared_calibration
 
 
 def same(first: Calibration, second: Calibration) -> bool:
@@ -160,7 +160,7 @@ def test_a_turn_during_which_the_car_stood_is_none(frames, result):
     assert found.verdict.level == 'weak'
 
 
-def test_one_thread_and_a_child_that_is_killed_change_nothing(frames, result):
+def test_two_threads_and_a_child_that_is_killed_change_nothing(frames, result):
     killed = []
 
     def assassin(calibrator: Calibrator, ended: threading.Event) -> None:
@@ -172,7 +172,7 @@ def test_one_thread_and_a_child_that_is_killed_change_nothing(frames, result):
                     killed.append(pid)
 
     ended = threading.Event()
-    with limited(Calibrator(QUICK.replace({'threads': 1}))) as calibrator:
+    with limited(Calibrator(QUICK.replace({'threads': 2}))) as calibrator:
         thread = threading.Thread(target=assassin, args=(calibrator, ended), daemon=True)
         thread.start()
         try:

@@ -2,7 +2,6 @@
 """Fleets without pictures: clips that are gathered turns with exact truth."""
 from __future__ import annotations
 
-import pickle
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -30,19 +29,6 @@ class Here:
 
     def close(self) -> None:
         pass
-
-
-def remembered(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the function with its results kept, for fleets that run again and again."""
-    kept: dict[bytes, bytes] = {}
-
-    def call(*arguments: Any) -> Any:
-        key = pickle.dumps(arguments)
-        if key not in kept:
-            kept[key] = pickle.dumps(function(*arguments))
-        return pickle.loads(kept[key])
-
-    return call
 
 
 def lens_of(focal_factor: float = 1.0, lens: Radial = LENS) -> Radial:

@@ -2,8 +2,10 @@
 """Made scenes, solved."""
 from __future__ import annotations
 
-from collections.abc import Sequence
+import pickle
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from synthetic import LENS, SIZE, synthetic_turn
@@ -33,11 +35,23 @@ def solved(scenes: Sequence[Scene], config: Config = CONFIG) -> Solution:
     return solution
 
 
+def remembered(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the function with its results kept, where the same is asked again and again."""
+    kept: dict[bytes, bytes] = {}
+
+    def call(*arguments: Any) -> Any:
+        key = pickle.dumps(arguments)
+        if key not in kept:
+            kept[key] = pickle.dumps(function(*arguments))
+        return pickle.loads(kept[key])
+
+    return call
+
+
 def z_of(solution: Solution, truth: Camera = LENS) -> np.ndarray:
     """Return how many sigmas each parameter is off; those that truth's model lacks are 0."""
     more = len(solution.camera.params) - len(truth.params)
     return (solution.camera.params - np.pad(truth.params, (0, more))) / solution.sigma
-
 
 
 def with_camera(solution: Solution, camera: Camera) -> Solution:

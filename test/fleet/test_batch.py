@@ -11,8 +11,9 @@ import sys
 
 import numpy as np
 import pytest
-from fleet_made import CONFIG, YAWS, Here, clip_of, lens_of, remembered, written
+from fleet_made import CONFIG, YAWS, Here, clip_of, lens_of, written
 from made_drives import drive, images, smooth, write_bag, write_video
+from solving import remembered
 
 from dashcalib_ros.errors import ConfigError, OutputError
 from dashcalib_ros.fleet import fuse, storage

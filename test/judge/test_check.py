@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from solving import CONFIG, scenes_of, solved
+from solving import CONFIG, remembered, scenes_of, solved
 from synthetic import LENS, SIZE
 
 from dashcalib_ros.camera import Brown, Fisheye, Radial, misread
@@ -25,6 +25,7 @@ from dashcalib_ros.judge.difference import (
 )
 from dashcalib_ros.report import NamedCamera, compare
 from dashcalib_ros.report.compare import answers
+from dashcalib_ros.solve import start
 from dashcalib_ros.solve.spread import PictureSigma
 
 ACCEPTED = Verdict('accepted')
@@ -34,6 +35,14 @@ ACCEPTED = Verdict('accepted')
 def solution():
     # as sharp as real pictures: noise of 0.25 px would leave 0.6 % of fx unknown
     return solved(scenes_of(4, noise_px=0.1))
+
+
+@pytest.fixture(scope='module', autouse=True)
+def adjusted_once():
+    """Adjust the turns once to each camera that is asked about."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(start, 'costs_with', remembered(start.costs_with))
+        yield
 
 
 def ask(given, solution, verdict=ACCEPTED):

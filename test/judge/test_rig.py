@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from made_calibration import MOUNT, make_calibration
 from scipy.spatial.transform import Rotation
-from shared_drive import LENS, QUICK, SPEC
+from shared_drive import LENS, SPEC, calibrated
 
-from dashcalib_ros import Calibrator
 from dashcalib_ros.demo import Drive
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.judge import TurnSummary
@@ -22,19 +21,13 @@ REAR = replace(MOUNT, yaw_left_deg=-178.0, pitch_up_deg=3.0, roll_right_deg=2.0,
                sigma={**MOUNT.sigma, 'roll_right_deg': 0.3})
 
 
-def calibrated(drive):
-    with Calibrator(QUICK) as calibrator:
-        for frame in drive.frames():
-            calibrator.push(frame)
-        return calibrator.calibrate()
-
-
 @pytest.fixture(scope='module')
-def two(shared_drive):
+def two(shared_drive, shared_calibration):
     """The drive by a camera that looks ahead, and by one turned half about the vertical."""
     back = Drive(LENS, SPEC)
     back.ride = replace(back.ride, mount=np.diag([-1.0, -1.0, 1.0]) @ back.ride.mount)
-    return [(calibrated(drive), drive.ride.mount) for drive in (shared_drive, back)]
+    return [(shared_calibration, shared_drive.ride.mount),
+            (calibrated(back.frames()), back.ride.mount)]
 
 
 def test_each_camera_of_one_car_knows_where_it_looks(two):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -46,6 +47,12 @@ def drive():
     order = np.argsort(when := np.r_[known, still], kind='stable')
     values = np.concatenate([*rates, np.zeros((len(still), 3))])[order]
     return solved(scenes), when[order], values
+
+
+@pytest.fixture(scope='module')
+def alone(drive):
+    """Return what gives the solution of one turn of the drive, as pictures alone give it."""
+    return functools.cache(lambda turn: solved([drive[0].scenes[turn]]))
 
 
 def gyro(drive, scale=1.0, density_deg=0.02, bias_deg=0.2, late_s=LATE_S, unit=1.0, seed=0):
@@ -137,10 +144,10 @@ def test_the_pace_of_the_clocks_is_measured_by_several_turns(drive, faster):
     assert np.sqrt(ran.covariance[6, 6]) > abs(faster) > np.sqrt(plain.covariance[6, 6])
 
 
-def test_one_turn_has_the_prior_of_the_pace(drive):
+def test_one_turn_has_the_prior_of_the_pace(drive, alone):
     rate = gyro(drive).rate
     for turn in range(TURNS):
-        solution = alone(drive, turn)
+        solution = alone(turn)
         steps = steps_of(solution.scenes[0], solution, 0.3, START_S)
         assert np.sqrt(fit_to([steps], rate).covariance[8, 8]) < PACE
 
@@ -255,15 +262,10 @@ def test_noisy_gps_does_no_harm(drive):
         assert said is None or said.agrees
 
 
-def alone(drive, turn):
-    """Return the solution of one turn of the drive, as pictures alone give it."""
-    return solved([drive[0].scenes[turn]])
-
-
-def test_a_calibrated_gyro_is_information_for_one_turn(drive):
+def test_a_calibrated_gyro_is_information_for_one_turn(drive, alone):
     pulls = []
     for turn in range(len(drive[0].scenes)):
-        solution = alone(drive, turn)
+        solution = alone(turn)
         found = compare_sensors(solution, gyro(drive, density_deg=0.005), START_S, CALIBRATED)
         informed = found.solution
         assert informed.by_pictures is solution
@@ -279,8 +281,8 @@ def test_a_calibrated_gyro_is_information_for_one_turn(drive):
     assert np.abs(pulls).max() < 3
 
 
-def test_what_is_no_information_changes_nothing(drive):
-    solution = alone(drive, 0)
+def test_what_is_no_information_changes_nothing(drive, alone):
+    solution = alone(0)
     # its scale is unknown; it is wrong and says so not; it is to be a witness only
     as_witness = CALIBRATED.replace({'motion.use': 'witness'})
     for scale, config in ((1.0, CONFIG), (0.97, CONFIG), (1.2, CALIBRATED), (1.0, as_witness)):
@@ -288,9 +290,9 @@ def test_what_is_no_information_changes_nothing(drive):
         assert found.solution is solution and found.witnesses.gyro is not None
 
 
-def test_one_turn_is_not_moved_by_a_gyro_that_is_called_calibrated_and_is_not(drive):
+def test_one_turn_is_not_moved_by_a_gyro_that_is_called_calibrated_and_is_not(drive, alone):
     for scale in (0.975, 1.025):
-        solution = alone(drive, 0)
+        solution = alone(0)
         found = compare_sensors(solution, gyro(drive, scale), START_S, CALIBRATED)
         named = 'E-GYRO-UNCONFIRMED' in [each.code for each in found.unused]
         assert found.solution is solution and (named or not found.witnesses.gyro.agrees)
@@ -317,8 +319,8 @@ def with_town(drive, scale, seed=3, **given):
 
 
 @pytest.mark.parametrize('scale', [1.0, 1.02])
-def test_gps_calibrates_a_gyro_of_unknown_scale(drive, scale):
-    solution = alone(drive, 0)
+def test_gps_calibrates_a_gyro_of_unknown_scale(drive, alone, scale):
+    solution = alone(0)
     found = compare_sensors(solution, with_town(drive, scale), START_S, CONFIG)
     said = found.witnesses.gyro
     assert found.unused == () and said.agrees
@@ -330,8 +332,8 @@ def test_gps_calibrates_a_gyro_of_unknown_scale(drive, scale):
     assert abs(found.solution.camera.fx - LENS.fx) < 3 * found.solution.sigma[0]
 
 
-def test_a_scale_that_gps_contradicts_is_named_and_not_used(drive):
-    solution = alone(drive, 0)
+def test_a_scale_that_gps_contradicts_is_named_and_not_used(drive, alone):
+    solution = alone(0)
     found = compare_sensors(solution, with_town(drive, 1.03), START_S, CALIBRATED)
     assert 'E-GYRO-SCALE' in [each.code for each in found.unused]
     assert found.witnesses.gyro.agrees

@@ -74,12 +74,12 @@ def left(node, path):
 
 
 @pytest.mark.parametrize('program', ['calibrator', 'checker'])
-def test_200_random_transitions_leave_nothing(make_node, tmp_path, program):
+def test_random_transitions_leave_nothing(make_node, tmp_path, program):
     node, chance = make_node(program, image_transport='video'), random.Random(0)
     before, state = left(node, tmp_path / 'camera.yaml'), UNCONFIGURED
     assert before[3]
     started = failed = 0
-    for _ in range(200):
+    for _ in range(100):
         name = chance.choice([name for name, (begin, _) in TRANSITIONS.items() if begin == state])
         if name == 'configure' and chance.random() < 0.2:
             fail_once(node, chance.choice((ConfigError('E-TEST', 'odd'), ZeroDivisionError())))
