@@ -15,12 +15,12 @@ import difflib
 import functools
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import Any, TypeVar
 
-from dashcalib_ros.errors import ConfigError
+from dashcalib_ros.errors import ConfigError, shortened
 
 T = TypeVar('T')
 # names that an unknown setting is answered with
@@ -375,6 +375,21 @@ class Config:
         config = settings if isinstance(settings, Config) else cls().replace(
             {} if settings is None else settings)
         return config.replace(more) if more else config
+
+
+def known_of(pairs: Iterable[str]) -> dict[str, str]:
+    """Return the settings that NAME=VALUE pairs of what somebody knows mean; raises ConfigError.
+
+    They are not checked yet.
+    """
+    changes = {}
+    for pair in pairs:
+        name, equals, text = pair.partition('=')
+        if not equals:
+            raise ConfigError('E-KNOWN-FORM', f'what is known needs NAME=VALUE, such as '
+                                              f'stabiliser=no, not {shortened(pair)!r}')
+        changes[f'known.{name.strip()}'] = text.strip().replace('+-', '±')
+    return changes
 
 
 def _dotted(changes: Mapping[str, Any], known: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:

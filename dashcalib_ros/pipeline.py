@@ -41,6 +41,7 @@ from dashcalib_ros.selection import SceneSelection
 from dashcalib_ros.solve import solve
 from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.workers.child import ChildWorker
+from dashcalib_ros.workers.memory import in_a_file
 from dashcalib_ros.workers.pool import ScenePool
 from dashcalib_ros.workers.worker import InlineWorker, Progress, Worker, WorkerDiedError
 
@@ -49,9 +50,10 @@ from dashcalib_ros.workers.worker import InlineWorker, Progress, Worker, WorkerD
 class Status:
     """The calibrator's state after a frame.
 
-    frames: pushed so far. turns: in the bank and stored. built: how many scenes a calibration
-    would use now; ready: their turns; yaw_deg: the sum of their yaw. stored: how many turns are of
-    earlier drives. magnitude: the newest filtered turning magnitude, of the image width.
+    frames: pushed so far. turns: in the bank and stored. built: how many turns' scenes a
+    calibration would use now; ready: these turns; yaw_deg: the sum of their yaw. stretches: of
+    the drive besides that it would use; bends: how many of these have yaw. stored: how many turns
+    are of earlier drives. magnitude: the newest filtered turning magnitude, of the image width.
     yaws_deg: of the turns in ready, in their order; ways: where these go, as direction() says.
     reconstructed: the turns that watch() has scenes of, chosen or not. two_cameras: what the
     newest images show, if they are of two.
@@ -69,6 +71,12 @@ class Status:
     reconstructed: tuple[TurnId, ...] = ()
     two_cameras: str = ''
     ways: tuple[str, ...] = ()
+    stretches: tuple[TurnId, ...] = ()
+    bends: int = 0
+
+
+# degrees of yaw; what has less is straight on
+BEND_DEG = 3.0
 
 
 @dataclass(frozen=True)
@@ -142,7 +150,8 @@ class Calibrator:
         if live:
             # nothing else runs during an import: while images come, some would be lost
             _load_judging()
-        self.detection = Detection(config, mask, beside=not live, stretches=not live)
+        self.detection = Detection(config, mask, beside=not live,
+                                   keep=None if live else in_a_file)
         self.workers = ScenePool(config, InlineWorker if inline else child,
                                  partial(_load_all if live else _load_solving,
                                          config.reconstruct.used),
@@ -159,6 +168,8 @@ class Calibrator:
         if new_turns:
             self.scenes.submit(more_to_come=True)  # turns -> scenes, in the background
         self._detect_s += time.monotonic() - started
+        if self._live:
+            self.scenes.submit_stretch()
         self.scenes.make_room()
         return self.status()
 
@@ -312,7 +323,9 @@ class Calibrator:
         were read with the same camera before are not read again. Raises InputError where the
         camera is for pictures of another size.
         """
-        small, config, scenes = self._resized(camera), self.scenes.config, self.scenes.all_scenes()
+        small, config = self._resized(camera), self.scenes.config
+        scenes = {scene.turn: scene for scene in self.scenes.turns_of(
+            self.scenes.all_scenes().values())}
         if self._watched != small:
             self._watched, self._readings = small, {}
         new = [scene for turn, scene in scenes.items() if turn not in self._readings]
@@ -361,14 +374,20 @@ class Calibrator:
         """
         found = self.detection
         self.scenes.store_new()
-        chosen, stored = self.scenes.chosen(), len(self.scenes.stored())
+        used, stored = self.scenes.chosen(), len(self.scenes.stored())
+        chosen = self.scenes.turns_of(used)
+        turns = {scene.turn for scene in chosen}
+        further = [scene for scene in used if scene.turn not in turns]
         return Status(found.frames, len(found.turns()) + stored, len(chosen),
                       sum(scene.yaw_deg for scene in chosen), found.magnitude,
                       found.standing, tuple(scene.turn for scene in chosen), stored,
                       tuple(scene.yaw_deg for scene in chosen),
-                      tuple(self.scenes.all_scenes()),
+                      tuple(scene.turn for scene in self.scenes.turns_of(
+                          self.scenes.all_scenes().values())),
                       str(found.other_camera) if found.mixed else '',
-                      tuple(map(direction, chosen)))
+                      tuple(map(direction, chosen)),
+                      tuple(scene.turn for scene in further),
+                      sum(scene.yaw_deg >= BEND_DEG for scene in further))
 
     def __enter__(self) -> Calibrator:
         return self

@@ -2,13 +2,14 @@
 """Which turns are reconstructed, and which scenes a calibration uses."""
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Set
+from collections.abc import Callable, Collection, Iterable, Mapping, Set
 from dataclasses import replace
 
 from dashcalib_ros.arrays import Mask
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Turn, TurnId
 from dashcalib_ros.detect.detection import Detection
+from dashcalib_ros.detect.turn import is_turn
 from dashcalib_ros.errors import Notice, WorkerError
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.store.scene_file import Origin, StoredTurn
@@ -49,7 +50,8 @@ class SceneSelection:
         self._places = config.turns.wanted
         # turns of this drive that are used beyond that
         self._more = 0
-        # whether other stretches are used even where there are enough turns
+        # whether other stretches are used at all, and even where there are enough turns
+        self._stretches_wanted = not live
         self._stretches = config.turns.thorough
         # why turns do not count any more
         self._excluded: dict[TurnId, str] = {}
@@ -71,12 +73,14 @@ class SceneSelection:
 
     # which turns count ------------------------------------------------------------------------
 
-    def want(self, turns: int, more: int = 0) -> None:
+    def want(self, turns: int, more: int = 0, stretches: bool = True) -> None:
         """Use this number of turns from the next calibration on, at most turns.capacity.
 
-        more: turns of this drive are used beyond those.
+        more: turns of this drive are used beyond those. stretches: whether other stretches of the
+        drive are, where turns are few; until it is called, those of a live drive are not.
         """
         self._more = more
+        self._stretches_wanted = stretches
         if turns != self.config.turns.wanted:
             self.config = self.config.replace({'turns.wanted': turns})
             self._places = turns
@@ -124,27 +128,47 @@ class SceneSelection:
         scenes = self.all_scenes()
         return [scenes[key] for key in self._best(scenes)]
 
+    def turns_of(self, scenes: Iterable[Scene]) -> list[Scene]:
+        """Return those of the scenes that are of turns, not of other stretches."""
+        turns = {turn.id for turn in self._detection.turns()} | {
+            key for key, turn in self._store.turns.items() if is_turn(turn.prominence)}
+        return [scene for scene in scenes if scene.turn in turns]
+
+    def _prominences(self) -> list[tuple[TurnId, float]]:
+        """Return all turns that count, and the stored stretches; those of this drive first."""
+        found = [(turn.id, turn.prominence) for turn in self._detection.turns()]
+        return found + [(key, turn.prominence) for key, turn in self._store.turns.items()
+                        if key not in self._excluded]
+
     def _ranked(self) -> list[TurnId]:
         """Return all turns that count, the most prominent first; those of earlier drives behind.
 
         These may be another camera's, and must not crowd out those of this drive.
         """
-        found = [(False, -turn.prominence, turn.id) for turn in self._detection.turns()]
-        found += [(True, -turn.prominence, key) for key, turn in self._store.turns.items()
-                  if key not in self._excluded]
-        return [key for *_, key in sorted(found)]
+        return [key for *_, key in sorted((not key.of_this_drive, -prominence, key)
+                                          for key, prominence in self._prominences()
+                                          if is_turn(prominence))]
 
     def _best(self, among: Collection[TurnId]) -> list[TurnId]:
         """Return the turns to use, best first; none where none is of this drive."""
         ranked = [key for key in self._ranked() if key in among]
         own = [key for key in ranked if key.of_this_drive][:self._places + self._more]
         stretches = [turn.id for turn in self._other_stretches(len(own)) if turn.id in among]
-        found = own + ranked[len(own):self._places] if own else []
-        return found + stretches
+        if not own and not stretches:
+            return []
+        found = own + [key for key in ranked if not key.of_this_drive][:max(
+            self._places - len(own), 0)]
+        if self._stretches or len(found) < self._places:
+            # of drives that had too few turns, too
+            earlier = [(-prominence, key) for key, prominence in self._prominences()
+                       if not is_turn(prominence) and key in among]
+            stretches += [key for _, key in sorted(earlier)]
+        return found + stretches[:self.config.turns.stretches]
 
     def _other_stretches(self, turns: int) -> tuple[Turn, ...]:
         """Return the stretches to use beside so many turns of this drive."""
-        return (self._detection.stretches() if self._stretches or turns < self._places else ())
+        few = self._stretches_wanted and turns < self._places
+        return self._detection.stretches() if self._stretches or few else ()
 
     # turns -> scenes --------------------------------------------------------------------------
 
@@ -161,7 +185,7 @@ class SceneSelection:
         # how many turns there are is known at the end of the drive
         count = sum(turn not in built or built[turn] is not None for turn in turns)
         stretches = () if more_to_come else self._other_stretches(count)
-        turns |= {turn.id: turn for turn in stretches}
+        turns |= {turn.id: turn for turn in self._detection.stretches()}
         self._workers.keep_only(set(turns))
         self._excluded = {key: why for key, why in self._excluded.items()
                           if key in turns or key in self._store.turns}
@@ -184,9 +208,23 @@ class SceneSelection:
             self._workers.submit(turn, self._valid[turn.id])
             self._detection.release(turn.center)
         if not self._live:
-            held = {key for key, turn in turns.items() if turn.frames}
+            held = {turn.id for turn in self._detection.turns() if turn.frames}
             for key in held - self._in_a_file - {turn.id for turn in due}:
                 self._set_aside(turns[key])
+
+    def submit_stretch(self) -> None:
+        """Have another stretch of a live drive reconstructed, where workers have nothing to do.
+
+        None once a single turn is missing: that one must not wait for a worker.
+        """
+        few = (self._stretches_wanted
+               and len(self._detection.turns()) < max(self._places - 1, 1))
+        self._detection.want_stretches(few)
+        if few and not self._workers.unbuilt():
+            for turn in self._detection.stretches():
+                if turn.frames:
+                    self._workers.submit(turn, self._detection.valid())
+                    self._detection.release(turn.center)
 
     def _set_aside(self, turn: Turn) -> None:
         """Move the pictures of a turn that waits out of the memory."""
@@ -199,9 +237,6 @@ class SceneSelection:
     def make_room(self) -> None:
         """Wait, unless live, until few turns wait in memory; raises what a worker raised."""
         if not self._live:
-            for turn in self._detection.stretches():
-                if turn.frames and turn.id not in self._in_a_file:
-                    self._set_aside(turn)
             # one beside those that the workers have: the detection goes on, and none of them idles
             self._workers.wait(lambda: len(self._workers.unbuilt()) <= self.config.threads + 1)
 

@@ -507,6 +507,50 @@ def test_turns_of_this_drive_come_before_more_prominent_ones_of_earlier_drives(o
     assert ''.join('o' if turn.of_this_drive else 's' for turn in chosen) == used
 
 
+def live_selection(turns, stretches, busy=()):
+    """Return a live drive's selection, what it submits, and whether it wants more stretches."""
+    submitted, wanted = [], []
+    selection = SceneSelection(
+        QUICK.replace({'turns.wanted': 5}),
+        types.SimpleNamespace(
+            turns=lambda: tuple(Turn(n, n, n, float(n), 0.1) for n in range(turns)),
+            stretches=lambda: stretches, valid=lambda: None, want_stretches=wanted.append,
+            release=lambda center: None),
+        types.SimpleNamespace(scenes=dict, unbuilt=lambda: frozenset(busy),
+                              submit=lambda turn, valid: submitted.append(turn.center)), True)
+    return selection, submitted, wanted
+
+
+@pytest.mark.parametrize(('turns', 'busy', 'asked', 'begun'), [
+    (0, (), True, [50]), (3, (), True, [50]), (4, (), True, []), (0, (TurnId.at(1),), True, []),
+    (0, (), False, [])])
+def test_a_live_drive_takes_a_stretch_while_workers_idle_and_turns_are_few(
+        frames, turns, busy, asked, begun):
+    stretches = (Turn(20, 0, 40, 2.0, 0.002), Turn(50, 41, 80, 5.0, 0.001, tuple(frames[:2])))
+    selection, submitted, wanted = live_selection(turns, stretches, busy)
+    selection.want(5, 0, asked)
+    selection.submit_stretch()
+    assert submitted == begun and wanted == [asked and turns < 4]
+
+
+def test_stretches_of_earlier_drives_fill_up_and_are_no_turns():
+    scene, own = garbage(), Turn(20, 0, 40, 2.0, 0.002)
+    selection = SceneSelection(
+        QUICK.replace({'turns.wanted': 3, 'turns.stretches': 3}),
+        types.SimpleNamespace(turns=tuple, stretches=lambda: (own,)),
+        types.SimpleNamespace(scenes=lambda: {own.id: replace(scene, turn=own.id)}))
+    selection._store.turns = {TurnId.stored(n): StoredTurn(
+        replace(scene, turn=TurnId.stored(n)), 0.0, prominence)
+        for n, prominence in enumerate((0.001, 0.9, 0.002, 0.0005))}
+    chosen = selection.chosen()
+    assert [scene.turn for scene in chosen] == [
+        TurnId.stored(1), own.id, TurnId.stored(2), TurnId.stored(0)]
+    assert [scene.turn for scene in selection.turns_of(chosen)] == [TurnId.stored(1)]
+    selection._store.turns |= {TurnId.stored(n): StoredTurn(scene, 0.0, 0.9) for n in (5, 6)}
+    # enough of other drives' turns; this one's stretch stays, which they must agree with
+    assert [str(turn.turn) for turn in selection.chosen()][3:] == [str(own.id)]
+
+
 @pytest.mark.parametrize(('more_to_come', 'begun'), [(True, [0]), (False, [0, 1, 2, 3])])
 def test_the_least_turns_wait_for_better_ones(frames, more_to_come, begun):
     turns = tuple(Turn(n, n, n, float(n), 0.1 - 0.01 * n, tuple(frames[:2])) for n in range(4))

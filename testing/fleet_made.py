@@ -36,8 +36,12 @@ def lens_of(focal_factor: float = 1.0, lens: Radial = LENS) -> Radial:
 
 
 def clip_of(lens: Radial = LENS, yaws: Sequence[float] = YAWS[:1], world: int = 0,
-            start_s: float = 0.0, start: Camera | None = None, **options: Any) -> SceneFile:
-    """Return a clip with these turns. world: of its first one; each has a world of its own."""
+            start_s: float = 0.0, start: Camera | None = None, prominence: float = 0.05,
+            **options: Any) -> SceneFile:
+    """Return a clip with these turns. world: of its first one; each has a world of its own.
+
+    prominence: of the first one; below 0.0025 they are other stretches than turns.
+    """
     # as a turn's own adjustment leaves it
     start = start or Radial.centred(SIZE, lens.fx, lens.k1, lens.k2)
     turns = []
@@ -47,7 +51,7 @@ def clip_of(lens: Radial = LENS, yaws: Sequence[float] = YAWS[:1], world: int = 
         # as in a file, so that what is read equals what is made
         scene = replace(scene, tracks=replace(
             scene.tracks, xy=scene.tracks.xy.astype(np.float32).astype(float)))
-        turns.append(StoredTurn(scene, start_s + 10.0 * n, 0.05 - 0.001 * n))
+        turns.append(StoredTurn(scene, start_s + 10.0 * n, prominence * (1 - 0.02 * n)))
     return SceneFile(Origin(lens.image_size), tuple(turns), len(turns), f'{world:032x}', 'abc',
                      100 * len(yaws) + 50, 10.0 * len(yaws) + 5.0)
 

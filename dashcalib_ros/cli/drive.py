@@ -9,7 +9,7 @@ from typing import Any
 
 from dashcalib_ros import session
 from dashcalib_ros.camera import searched
-from dashcalib_ros.config import Config
+from dashcalib_ros.config import Config, known_of
 from dashcalib_ros.errors import ConfigError, InputError, shortened
 from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
 from dashcalib_ros.session import Recording
@@ -29,12 +29,7 @@ def read_config(args: argparse.Namespace) -> Config:
     changes = parse_settings(getattr(args, 'set', []))
     changes.update({name: getattr(args, flag) for flag, names in FLAGS.items() for name in names
                     if getattr(args, flag, None) is not None})
-    for pair in getattr(args, 'known', []):
-        name, equals, text = pair.partition('=')
-        if not equals:
-            raise ConfigError('E-KNOWN-FORM', f'--known needs NAME=VALUE, such as stabiliser=no, '
-                                              f'not {shortened(pair)!r}')
-        changes[f'known.{name.strip()}'] = text.strip().replace('+-', '±')
+    changes |= known_of(getattr(args, 'known', []))
     config = config.replace(changes)
     searched(config.model)  # raises for an unknown model before any work begins
     return config

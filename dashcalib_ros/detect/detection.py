@@ -15,7 +15,7 @@ from dashcalib_ros.detect.edges import LineCollector, Lines
 from dashcalib_ros.detect.estimator import MotionEstimator, TrackedPoints
 from dashcalib_ros.detect.one_camera import APART, OtherCamera, TwoPictures
 from dashcalib_ros.detect.straights import PAIRS, Straights
-from dashcalib_ros.detect.stretches import StretchBank
+from dashcalib_ros.detect.stretches import Keep, StretchBank
 from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.errors import InputError, Notice
 from dashcalib_ros.input import Frame
@@ -40,10 +40,10 @@ class Detection:
     """
 
     def __init__(self, config: Config, mask: Mask | None = None, beside: bool = False,
-                 stretches: bool = True) -> None:
+                 keep: Keep | None = None) -> None:
         """mask: (h, w), False on the ego vehicle. beside: a thread of its own finds the lines.
 
-        stretches: whether other stretches of the drive than its turns are kept.
+        keep: as the StretchBank's.
 
         Raises ConfigError where the segmentation model cannot be used.
         """
@@ -63,8 +63,8 @@ class Detection:
         # more turns than wanted replace those without a scene; --turns may be above the capacity
         self._turns = TurnDetector(replace(
             config.turns, capacity=max(config.turns.capacity, config.turns.wanted)))
-        self._stretches = StretchBank(config.turns.stretches if stretches else 0,
-                                      2 * config.turns.half_width, self.turns)
+        self._stretches = StretchBank(config.turns.stretches, 2 * config.turns.half_width,
+                                      self.turns, keep)
 
     @property
     def start_s(self) -> float:
@@ -131,6 +131,10 @@ class Detection:
     def stretches(self) -> tuple[Turn, ...]:
         """Return other stretches of the drive, those first that promise most."""
         return self._stretches.stretches()
+
+    def want_stretches(self, wanted: bool) -> None:
+        """Collect such stretches from now on, or none."""
+        self._stretches.want(wanted)
 
     def release(self, center: int) -> None:
         """Free the images of the turn with this center; the turn itself is kept."""
@@ -216,13 +220,15 @@ class Detection:
                 f'program that writes them')
 
 
-def detect(frames: Iterable[Frame], config: Config, mask: Mask | None = None) -> Detection:
+def detect(frames: Iterable[Frame], config: Config, mask: Mask | None = None,
+           keep: Keep | None = None) -> Detection:
     """Find the turns of a drive. For a stream, call Detection.push() for each frame.
 
-    No other stretches are kept. mask: (h, w), False on the ego vehicle. Raises InputError as
-    Detection.push() does.
+    mask: (h, w), False on the ego vehicle. keep: how the images of other stretches are kept; None:
+    there are none. Raises InputError as Detection.push() does.
     """
-    detection = Detection(config, mask, stretches=False)
+    detection = Detection(config, mask, keep=keep)
+    detection.want_stretches(keep is not None)
     for frame in frames:
         detection.push(frame)
     detection.finish()

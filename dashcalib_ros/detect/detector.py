@@ -13,11 +13,9 @@ from dashcalib_ros.config import TurnsConfig
 from dashcalib_ros.detect.bank import TurnBank
 from dashcalib_ros.detect.estimator import Motion
 from dashcalib_ros.detect.peaks import Peak, PeakFinder, StreamingMedian
-from dashcalib_ros.detect.turn import Turn
+from dashcalib_ros.detect.turn import MIN_PROMINENCE, Turn, is_turn
 from dashcalib_ros.input import Frame
 
-# of the image width; kitti03's sharp turn has 0.050, its bends of 0.4 to 0.6 deg a frame 0.005
-MIN_PROMINENCE = 0.0025
 # ns; header stamps are rounded: an image exactly half a width away belongs to the turn
 ROUNDING = 1_000_000
 # least prominences; where the magnitude is higher at an edge of the drive, that may be a turn:
@@ -193,8 +191,7 @@ class TurnDetector:
         """Return whether no peak can come that hides a candidate."""
         return (bool(self._candidates)
                 and self._peaks.earliest_ns - self._candidates[-1].peak.stamp_ns > self._reach_ns
-                and all(each.peak.prominence >= MIN_PROMINENCE
-                        for each in self._candidates))
+                and all(is_turn(each.peak.prominence) for each in self._candidates))
 
     def _judge(self, final: bool) -> None:
         """Put the candidates that are turns into the bank.
@@ -204,7 +201,7 @@ class TurnDetector:
         """
         turns: list[_Candidate] = []
         for each in reversed(self._candidates):
-            ready = each.frames and each.peak.prominence >= MIN_PROMINENCE
+            ready = each.frames and is_turn(each.peak.prominence)
             if ready and not (turns and self._near(each.peak, turns[-1].peak)):
                 turns.append(each)
         self.bank.set_newest([(each.peak, each.frames) for each in reversed(turns)], final)

@@ -13,14 +13,17 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from dashcalib_ros.detect.detector import MIN_PROMINENCE
-from dashcalib_ros.detect.turn import Turn
+from dashcalib_ros.arrays import GreyImage
+from dashcalib_ros.detect.turn import MIN_PROMINENCE, Turn
 from dashcalib_ros.input import Frame
 
 # s; what a turn leaves of a tile must be as long
 LEAST_S = 3.0
-# tiles that wait: by then a turn in them is known
-WAITING = 2
+# tiles that wait: by then a turn in them is known; of a live drive, where memory counts, one
+WAITING, WAITING_LIVE = 2, 1
+
+# how the images of a stretch are kept
+Keep = Callable[[Sequence[GreyImage]], Sequence[GreyImage]]
 
 
 @dataclass
@@ -58,25 +61,35 @@ class _Tile:
 class StretchBank:
     """Keeps the `capacity` stretches that promise most, in bounded memory; none overlaps a turn.
 
-    turns: those that are known now, the latest ones too.
+    turns: those that are known now, the latest ones too. keep: how images are kept; None: those
+    of one stretch at a time are, as they are, until it is taken: a better one replaces it.
     """
 
-    def __init__(self, capacity: int, tile_s: float, turns: Callable[[], Sequence[Turn]]) -> None:
+    def __init__(self, capacity: int, tile_s: float, turns: Callable[[], Sequence[Turn]],
+                 keep: Keep | None = None) -> None:
+        self._wanted = capacity > 0
         self._capacity = capacity
         self._tile_s = tile_s
         self._turns = turns
+        self._keep = keep
         self._tile = _Tile()
         self._waiting: deque[_Tile] = deque()
         self._kept: list[Turn] = []
 
     def push(self, frame: Frame, shift: tuple[float, float], after_gap: bool) -> None:
         """Take the next image, and how far the median point moved before it, of the width."""
-        if not self._capacity:
+        if not self._wanted:
             return
         if after_gap or self._tile.seconds >= self._tile_s:
-            self._end_tile(WAITING)
+            self._end_tile(WAITING if self._keep else WAITING_LIVE)
         self._tile.frames.append(frame)
         self._tile.shifts.append(shift if np.isfinite(shift).all() else (0.0, 0.0))
+
+    def want(self, wanted: bool) -> None:
+        """Collect stretches from now on, or none, and free all images."""
+        if self._wanted and not wanted:
+            self.free_images()
+        self._wanted = wanted and self._capacity > 0
 
     def finish(self) -> None:
         """End the drive: all turns are known."""
@@ -106,5 +119,16 @@ class StretchBank:
         while len(self._waiting) > waiting:
             tile = self._waiting.popleft().without(self._turns())
             if tile.seconds >= LEAST_S:
-                self._kept = sorted([*self._kept, tile.stretch()],
-                                    key=lambda each: -each.prominence)[:self._capacity]
+                self._add(tile.stretch())
+
+    def _add(self, new: Turn) -> None:
+        before = [each for each in self._kept if self._keep or not each.frames
+                  or each.prominence > new.prominence]
+        if not self._keep and any(each.frames for each in before):
+            return
+        self._kept = sorted([*before, new], key=lambda each: -each.prominence)[:self._capacity]
+        if self._keep and new in self._kept:
+            images = self._keep([frame.image for frame in new.frames])
+            self.exchange(new.center, tuple(
+                replace(frame, image=image)
+                for frame, image in zip(new.frames, images, strict=True)))

@@ -8,6 +8,7 @@ not done again.
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
@@ -78,6 +79,13 @@ class Camera:
     verdict: str = 'refused'
     clips: Sequence[Mapping[str, Any]] = ()
     row: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def known(self) -> dict[str, str]:
+        """Return the settings known.* that its rows have; what two of them contradict is not."""
+        found = {pair for row in self.rows for pair in row.known}
+        names = Counter(name for name, _ in found)
+        return {name: value for name, value in found if names[name] == 1}
 
     @property
     def gathered(self) -> list[tuple[Row, ClipResult]]:
@@ -157,7 +165,8 @@ def _gather_and_solve(cameras: Sequence[Camera], out: str, config: Config, engin
                 tell(camera, None)
             elif camera.name:
                 engine.submit(Task(solve_camera, (camera.name, camera.make, camera.gathered, out,
-                                                  config), (camera, None)), first=True)
+                                                  config.replace(camera.known)),
+                                   (camera, None)), first=True)
 
 
 def _failed(camera: Camera, error: Exception) -> None:

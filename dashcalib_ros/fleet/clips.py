@@ -8,12 +8,14 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.detection import detect
 from dashcalib_ros.detect.one_camera import APART
+from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.errors import (
     DashcalibError,
     InputError,
@@ -37,6 +39,7 @@ from dashcalib_ros.fleet.storage import (
 from dashcalib_ros.input.inputs import open_frames
 from dashcalib_ros.limits import read_file
 from dashcalib_ros.reconstruct import reconstruct
+from dashcalib_ros.solve.evidence import SHARP_DEG
 from dashcalib_ros.store.scene_file import (
     FORMAT,
     LARGEST,
@@ -48,13 +51,14 @@ from dashcalib_ros.store.scene_file import (
     encoded,
 )
 from dashcalib_ros.whole_files import FULL
+from dashcalib_ros.workers.memory import in_a_file
 
 # settings by which a clip's scenes do not change
-LATER = ('intrinsics.', 'verdict.', 'fleet.')
+LATER = ('intrinsics.', 'verdict.', 'fleet.', 'known.')
 LATER_NAMES = ('threads', 'rectified', 'turns.store')
 GONE = coded(InputError('E-CLIP-MISSING', 'there is no such file; check the path'))
-# what is gathered of a clip; 2: its upright lines, too
-GATHERED = 2
+# what is gathered of a clip; 2: its upright lines, too; 3: other stretches than turns
+GATHERED = 3
 # characters of an error in a table, without its code
 LONGEST = 300
 # bytes of a file that are hashed at a time
@@ -248,21 +252,29 @@ def gather(path: Path, content: str, fps: float | None, topic: str | None, confi
     images of two cameras.
     """
     source = open_frames(path, topic, fps)
-    detection = detect(source, config)
+    detection = detect(source, config, keep=in_a_file)
     if detection.other_camera is not None:
         raise InputError('E-TWO-CAMERAS', f'{detection.other_camera}: {APART}')
     best = detection.turns()[:max(config.turns.wanted, config.turns.at_most)]
     valid = detection.valid()
-    turns = []
-    for turn in sorted(best, key=lambda turn: turn.center):
-        scene = reconstruct(turn, config, valid)
-        detection.release(turn.center)
-        if scene is not None:
-            turns.append(StoredTurn(scene, turn.stamp_s, turn.prominence))
+
+    def stored(those: Iterable[Turn]) -> Iterator[StoredTurn]:
+        for turn in sorted(those, key=lambda turn: turn.center):
+            scene = reconstruct(turn, config, valid)
+            detection.release(turn.center)
+            if scene is not None:
+                yield StoredTurn(scene, turn.stamp_s, turn.prominence)
+
+    turns, stretches = list(stored(best)), list[StoredTurn]()
+    # a sharp turn says more than all of them
+    if config.turns.thorough or all(turn.scene.yaw_deg < SHARP_DEG for turn in turns):
+        stretches = list(stored(detection.stretches()))
+    found = sorted([*turns, *stretches], key=lambda turn: turn.scene.turn.number)
     assert detection.size is not None
     # the same content gives the same, wherever it lies
     warnings = tuple(line.replace(str(path), 'the clip')
                      for line in (*source.warnings, *detection.warnings()))
-    return SceneFile(Origin(detection.size, detection.scale), tuple(turns), len(best), content,
+    return SceneFile(Origin(detection.size, detection.scale), tuple(found),
+                     len(best) + len(stretches), content,
                      settings_hash(config, fps, topic), detection.frames, detection.seconds,
                      warnings, detection.lines())

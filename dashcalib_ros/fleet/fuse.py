@@ -16,14 +16,14 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Bend, Lines
 from dashcalib_ros.detect.bend import GROUP_S
 from dashcalib_ros.detect.straights import StraightCollector
-from dashcalib_ros.detect.turn import TurnId
+from dashcalib_ros.detect.turn import TurnId, is_turn
 from dashcalib_ros.errors import Notice, coded, counted, spared
 from dashcalib_ros.fleet.solved import ClipShare, Estimate, Solved
 from dashcalib_ros.input.source import size_text
 from dashcalib_ros.judge import Verdict
-from dashcalib_ros.judge.agreement import focal_of, turns_of_another_camera
+from dashcalib_ros.judge.agreement import focal_of, sigma_of, turns_of_another_camera
 from dashcalib_ros.judge.conclude import Evidence, conclude, straight_lines
-from dashcalib_ros.judge.verdict import Grounds, lacks_knowledge_only
+from dashcalib_ros.judge.verdict import Grounds, lacks_knowledge_only, only_gentle
 from dashcalib_ros.reconstruct.repeated import without_repeated
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.robust import weighted_median
@@ -47,7 +47,22 @@ ROUNDS = 3
 
 
 def fuse(camera: str, make: str, clips: Clips, config: Config) -> Solved:
-    """Calibrate one camera from all its clips, by name; their order does not count."""
+    """Calibrate one camera from all its clips, by name; their order does not count.
+
+    As in one drive, other stretches than turns are used where turns are few or leave it weak.
+    """
+    turns = {name: replace(clip, turns=tuple(
+        turn for turn in clip.turns if is_turn(turn.prominence))) for name, clip in clips.items()}
+    count, everything = (sum(len(clip.turns) for clip in some.values())
+                         for some in (turns, clips))
+    if not config.turns.thorough and config.turns.wanted <= count < everything:
+        found = _fused(camera, make, turns, config)
+        if found.calibration.verdict.level != 'weak':
+            return found
+    return _fused(camera, make, clips, config)
+
+
+def _fused(camera: str, make: str, clips: Clips, config: Config) -> Solved:
     clips = dict(sorted(clips.items()))
     left_out = _same_content(clips)
     left_out.update(_other_origins(_without(clips, left_out)))
@@ -97,7 +112,9 @@ def _estimate(solution: Solution | None, origin: Origin, config: Config, lines: 
         solution.carried(solution.posterior.alike.covariance) * units,
         solution.picture.times(px),
         solution.reprojection_error_px * px,
-        lacks_knowledge_only(Grounds(solution, config.verdict, lines)))
+        # other units must not learn from what a stabiliser could have made
+        lacks_knowledge_only(Grounds(solution, config.verdict, lines))
+        and not only_gentle(solution))
 
 
 def _same_content(clips: Clips) -> dict[str, Notice]:
@@ -142,14 +159,15 @@ def _chosen(turns: Mapping[TurnId, ClipTurn], left_out: Mapping[str, Notice], co
     """Return the scenes to use, and which turns repeat others.
 
     Each clip's best turn first, then each clip's second, and so on, so that every clip has a say,
-    also about whether it is of this camera.
+    also about whether it is of this camera; then other stretches, likewise.
     """
     by_clip: dict[str, list[TurnId]] = {}
     for key in sorted(turns, key=lambda key: (-turns[key].stored.prominence, key)):
         if turns[key].clip not in left_out:
             by_clip.setdefault(turns[key].clip, []).append(key)
-    ranked = [key for _, _, key in sorted(
-        (place, -turns[key].stored.prominence, key)
+    # no stretch takes the place of a turn
+    ranked = [key for *_, key in sorted(
+        (not is_turn(turns[key].stored.prominence), place, -turns[key].stored.prominence, key)
         for keys in by_clip.values() for place, key in enumerate(keys))]
     repeated: dict[TurnId, TurnId] = {}
     while True:
@@ -247,10 +265,12 @@ def shares_of(solution: Solution | None, turns: Mapping[TurnId, ClipTurn], px: f
     """Return what each clip gave, and the fx of its turns alone."""
     if solution is None:
         return {}
-    found = {}
+    found: dict[str, ClipShare] = {}
     clips = {turns[scene.turn].clip for scene in solution.scenes}
+    so_far: list[int] = []
     for clip in sorted(clips):
         own = [n for n, scene in enumerate(solution.scenes) if turns[scene.turn].clip == clip]
-        focal = focal_of(solution, own)
-        found[clip] = ClipShare(used=len(own), fx=px * focal.fx, fx_sigma=px * focal.sigma)
+        focal, so_far = focal_of(solution, own), [*so_far, *own]
+        found[clip] = ClipShare(used=len(own), fx=px * focal.fx, fx_sigma=px * focal.sigma,
+                                sigma_so_far=px * sigma_of(solution, so_far))
     return found

@@ -14,6 +14,7 @@ from datetime import datetime, timezone
 from itertools import islice
 from typing import Any
 
+from dashcalib_ros.config import Config, known_of
 from dashcalib_ros.errors import ConfigError, InputError, one_line, shortened
 from dashcalib_ros.fleet import storage
 from dashcalib_ros.fleet.storage import needs
@@ -23,7 +24,7 @@ from dashcalib_ros.limits import MANIFEST_BYTES, MANIFEST_ROWS
 from dashcalib_ros.store.scene_file import LAST_S
 from dashcalib_ros.store.scene_file import SUFFIX as GATHERED
 
-COLUMNS = ('clip', 'camera', 'make', 'fps', 'topic', 'time')
+COLUMNS = ('clip', 'camera', 'make', 'fps', 'topic', 'time', 'known')
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,8 +33,8 @@ class Row:
 
     clip: as written, without credentials; place, which may have some, is nowhere shown or kept.
     camera: '' where it is unknown, then the clip is a camera of its own. make: '' where unknown.
-    time_s: when it was recorded, s since 1970; None where unknown. problem: why this row cannot
-    be used, '' if it can.
+    time_s: when it was recorded, s since 1970; None where unknown. known: settings known.* of its
+    camera. problem: why this row cannot be used, '' if it can.
     """
 
     number: int
@@ -45,6 +46,7 @@ class Row:
     topic: str | None = None
     time_s: float | None = None
     problem: str = ''
+    known: tuple[tuple[str, str], ...] = ()
 
     @property
     def name(self) -> str:
@@ -173,16 +175,24 @@ READERS: dict[str, Callable[[str, bytes], Iterator[Values]]] = {
 def _row(number: int, values: Values, folder: str) -> Row:
     if isinstance(values, str):
         return Row(number, '', '', problem=values)
-    clip, camera, make, fps, topic, time = (
+    clip, camera, make, fps, topic, time, known = (
         '' if values.get(name) is None else str(values[name]).strip() for name in COLUMNS)
     if not clip:
         return Row(number, '', '', camera, make, problem='names no clip')
     row = Row(number, storage.masked(clip), storage.joined(folder, clip), camera, make,
               topic=topic or None)
     try:
-        return replace(row, fps=_rate(fps) if fps else None, time_s=_time(time) if time else None)
-    except ValueError as error:
+        return replace(row, fps=_rate(fps) if fps else None, time_s=_time(time) if time else None,
+                       known=_known(known))
+    except (ValueError, ConfigError) as error:
         return replace(row, problem=str(error))
+
+
+def _known(text: str) -> tuple[tuple[str, str], ...]:
+    """Return what is known, of 'stabiliser=no; fx=1160±20'; raises ConfigError."""
+    found = known_of(part for part in re.split(r'[;,]\s*|\s+(?=\w+=)', text) if part)
+    Config().replace(found)
+    return tuple(sorted(found.items()))
 
 
 def _rate(text: str) -> float:

@@ -60,7 +60,7 @@ def overview_html(cameras: Rows, clips: Rows) -> str:
                           for rows, key in ((cameras, 'verdict'), (clips, 'status')))
     sections = [
         Section('Clips', ('status', 'clips'), sorted(statuses.items())), _makes(cameras),
-        _sigma_by_turns(cameras), _drift(cameras, clips),
+        _sigma_by_turns(cameras), _sigma_by_clips(cameras, clips), _drift(cameras, clips),
         Section('In another sensor mode than other cameras of their model',
                 ('camera', 'camera model', 'why'),
                 [(_link(row), row['make'] or '', row['prior_note'])
@@ -130,6 +130,29 @@ def _sigma_by_turns(cameras: Rows) -> Section:
     return Section(title, (), (), *_figure(
         'standard deviation (sigma) of fx of each camera, by the number of its turns that are '
         'used', axes, parts))
+
+
+def _sigma_by_clips(cameras: Rows, clips: Rows) -> Section:
+    title, own = 'Sigma of fx, clip by clip', {row['camera']: row for row in cameras if row['fx']}
+    lines: dict[str, list[float]] = {}
+    for row in sorted(clips, key=lambda row: str(row['clip'])):
+        if row['sigma_fx_so_far'] and row['camera'] in own:
+            lines.setdefault(row['camera'], []).append(
+                100 * row['sigma_fx_so_far'] / own[row['camera']]['fx'])
+    lines = {name: values for name, values in lines.items() if len(values) > 1}
+    if not lines:
+        return Section(title)
+    every = [value for values in lines.values() for value in values]
+    x = 0.9, 1.1 * max(map(len, lines.values()))
+    y = min(every) / 1.3, 1.3 * max(every)
+    axes = Axes(900, 320, x, y, log_x=True, log_y=True)
+    parts = [axes.frame('clips', 'sigma of fx, %', log_ticks(*x), log_ticks(*y))]
+    for name in sorted(lines)[::-(-len(lines) // LISTED)]:
+        steps = axes.places(np.arange(1.0, 1 + len(lines[name])), np.array(lines[name]))
+        parts.append(f'<g class="{own[name]["verdict"]}">' + strokes([steps], 'all-turns')
+                     + strokes(steps[:, None], 'dot all') + '</g>')
+    return Section(title, (), (), *_figure(
+        'sigma of fx of each camera with its first clip, its first two, and so on', axes, parts))
 
 
 def _drift(cameras: Rows, clips: Rows) -> Section:

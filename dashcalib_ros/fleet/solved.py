@@ -22,7 +22,7 @@ from dashcalib_ros.judge.calibration import Condition
 from dashcalib_ros.solve.spread import PictureSigma
 
 # of the JSON text
-FORMAT = 4
+FORMAT = 5
 
 
 @dataclass(frozen=True)
@@ -32,12 +32,14 @@ class ClipShare:
     used: turns in the adjustment. left_out: why none is, with a code, '' otherwise. fx, fx_sigma:
     of its turns alone, in px of the input, linearised at the camera's solution; None where
     unknown. The sigma is that of their noise, without how much turns differ beyond it.
+    sigma_so_far: of fx by this clip and all before it, by name; as the camera's.
     """
 
     used: int = 0
     left_out: str = ''
     fx: float | None = None
     fx_sigma: float | None = None
+    sigma_so_far: float | None = None
 
 
 @dataclass(frozen=True)

@@ -59,8 +59,8 @@ CLIP_COLUMNS = {
     **dict.fromkeys(('clip', 'camera', 'make', 'status', 'reason', 'code'), 'text'),
     'width': 'number', 'height': 'number', 'frames': 'number', 'seconds': 'real',
     **dict.fromkeys(('turns', 'scenes', 'turns_used'), 'number'),
-    **dict.fromkeys(('fx', 'sigma_fx_noise', 'time'), 'real'), 'content': 'text', 'file': 'text',
-    'warnings': 'texts'}
+    **dict.fromkeys(('fx', 'sigma_fx_noise', 'sigma_fx_so_far', 'time'), 'real'),
+    'content': 'text', 'file': 'text', 'warnings': 'texts'}
 
 
 def camera_row(solved: Solved, final: Final, clips: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -134,7 +134,7 @@ def clip_rows(camera: str, make: str, clips: Sequence[tuple[Row, ClipResult]],
             **vars(result), 'row': row.number, 'clip': row.clip, 'camera': camera,
             'make': make or None, 'status': status, 'reason': reason, 'code': _code(reason),
             'turns_used': share.used, 'fx': share.fx, 'sigma_fx_noise': share.fx_sigma,
-            'time': time})
+            'sigma_fx_so_far': share.sigma_so_far, 'time': time})
     return found
 
 

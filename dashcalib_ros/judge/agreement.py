@@ -106,9 +106,14 @@ def focal_of(solution: Solution, places: Iterable[int]) -> FocalEstimate:
 
 def sigma_by_count(solution: Solution) -> list[float]:
     """Return the sigma of fx with the first turn, with the first two, ... and with all, px."""
-    known = solution.posterior
-    return [float(np.sqrt(solution.carried(known.of(range(count)).covariance)[0, 0]))
-            for count in range(1, len(known.turns) + 1)]
+    return [sigma_of(solution, range(count))
+            for count in range(1, len(solution.posterior.turns) + 1)]
+
+
+def sigma_of(solution: Solution, places: Iterable[int]) -> float:
+    """Return the sigma of fx, px, that some of the turns would leave."""
+    some = solution.posterior.of(places)
+    return float(np.sqrt(solution.carried(some.covariance)[0, 0]))
 
 
 # of fx; a larger sigma helps nobody to decide

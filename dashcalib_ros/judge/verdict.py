@@ -197,14 +197,20 @@ def yaw_in_all(yaw_deg: float, config: VerdictConfig) -> Finding:
 
 def _only_gentle(grounds: Grounds) -> Finding | None:
     """Where nothing but gentle bends was seen, a stabiliser could have made the pictures."""
-    gentle, scenes = grounds.solution.perhaps_shifted, grounds.solution.scenes
-    if not scenes or not all(scene.turn in gentle for scene in scenes):
+    scenes = grounds.solution.scenes
+    if not only_gentle(grounds.solution):
         return None
     return Finding('E-ONLY-GENTLE', 'weak',
                    f'nothing but gentle bends and straight stretches was seen ({len(scenes)}), '
                    f'and a stabilised video would look the same',
                    'drive a turn at a crossing, or say --known stabiliser=no where the camera has '
                    'no stabiliser')
+
+
+def only_gentle(solution: Solution) -> bool:
+    """Return whether a stabiliser could have made all that was seen."""
+    return bool(solution.scenes) and all(scene.turn in solution.perhaps_shifted
+                                         for scene in solution.scenes)
 
 
 # relative rise of the error with fx 20 % off; less is weak, and less is refused

@@ -154,8 +154,12 @@ def _share(value: float | Floats, ends: tuple[float, float], log: bool) -> Float
 
 
 def magnitude_svg(magnitudes: Floats, turns: Sequence[TurnSummary],
-                  start_s: float | None = None) -> str:
+                  start_s: float | None = None, spans: Iterable[tuple[float, float, float]] = ()
+                  ) -> str:
     """Plot the turning magnitude over time, turns marked by their number, from 1.
+
+    spans: stamps, s, between which something counts, and its share of all information about fx:
+    so high a bar of the plot's height.
 
     magnitudes: as in Calibration; '' when there is nothing to plot. start_s: stamp of the drive's
     start, by default the first one here. Gaps (NaN: standing) stay gaps. However long the drive,
@@ -179,6 +183,8 @@ def magnitude_svg(magnitudes: Floats, turns: Sequence[TurnSummary],
     lines = strokes(_pieces(axes.places(seconds, magnitudes[:, 1]), finite), 'signal')
     found = ''.join(_mark(n, turn, x, row, axes)
                     for (n, turn, x), row in zip(marks, rows, strict=True))
+    found = ''.join(_bar(begin_s - start, end_s - start, share, axes)
+                    for begin_s, end_s, share in spans) + found
     frame = axes.frame('s since the start', 'turning magnitude, of the picture’s width',
                        ticks(*ends, 10), ticks(0.0, peak, 4))
     return svg(axes.width, axes.height, 'turning magnitude over time', frame + found + lines)
@@ -198,6 +204,13 @@ def mask_data_uri(mask: Mask) -> str:
     tint = np.zeros((*mask[::step, ::step].shape, 4), np.uint8)
     tint[~mask[::step, ::step]] = 255, 90, 150, 110
     return data_uri(tint, 'png')
+
+
+def _bar(begin_s: float, end_s: float, share: float, axes: Axes) -> str:
+    left, right = (float(axes.across(each)) for each in (begin_s, end_s))
+    high = min(max(share, 0.0), 1.0) * (axes.height - axes.top - axes.bottom)
+    return (f'<rect class="band" x="{left:.1f}" y="{axes.height - axes.bottom - high:.1f}" '
+            f'width="{max(right - left, 1.0):.1f}" height="{high:.1f}"/>')
 
 
 def _mark(number: int, turn: TurnSummary, x: float, row: int, axes: Axes) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 
 from dashcalib_ros.camera import FISHEYE, Camera
 from dashcalib_ros.config import Config
-from dashcalib_ros.detect.detector import MIN_PROMINENCE
+from dashcalib_ros.detect.turn import MIN_PROMINENCE
 from dashcalib_ros.errors import Notice, spared
 from dashcalib_ros.formats import calibrated_camera
 from dashcalib_ros.judge import CalibrationData
@@ -30,7 +30,7 @@ from dashcalib_ros.report.lens import (
     slider_of,
     uncertainty_of,
 )
-from dashcalib_ros.report.turns import turn_rows, turn_sections
+from dashcalib_ros.report.turns import spans_of, turn_rows, turn_sections
 from dashcalib_ros.report.wording import (
     ADVICE,
     FOLDER,
@@ -74,7 +74,7 @@ def report_html(calibration: CalibrationData, truth: NamedCamera | None = None,
         'slider': spared('the picture without distortion', lost, slider_of, c),
         'drive': '' if c.magnitudes is None else spared(
             'the plot of the drive', lost, magnitude_svg, c.magnitudes, c.turns,
-            c.start_s or None),
+            c.start_s or None, spans_of(c)),
         'turns': spared('the drawings of the turns', lost, turn_sections, c, mask_id, lost),
         'evidence': [*(spared('the plots of the evidence', lost, evidence_of, c, mask_id) or ()),
                      *(spared('the plot of the field', lost, field_of, c) or ())],

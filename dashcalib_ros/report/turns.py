@@ -73,8 +73,7 @@ def turn_sections(c: CalibrationData, mask_id: str | None, lost: list[Notice]
     """Return a section for each turn of which there is anything to see; lost: as for spared()."""
     if c.material is None:
         return []
-    alone, solution = _fx_alone(c), c.material.solution
-    shares = leverages(solution) if alone and solution is not None else {}
+    alone, shares = _fx_alone(c), _shares(c)
     texts = {turn: _alone_text(fx, sigma, shares.get(turn, 0.0))
              for turn, (fx, sigma) in alone.items()}
     found = [spared(f'the drawing of turn {name}', lost, _section, turn, c, c.material,
@@ -97,6 +96,19 @@ def _fx_alone(c: CalibrationData) -> dict[TurnId, tuple[float, float]]:
     alone = {turn: (found.fx * c.material.px, found.sigma * c.material.px)
              for turn, found in focal_of_turns(solution).items()}
     return alone if np.isfinite(list(alone.values())).all() else {}
+
+
+def _shares(c: CalibrationData) -> dict[TurnId, float]:
+    """Return each turn's share of the information about fx; none of a refused calibration."""
+    solution = c.material.solution if c.material and _fx_alone(c) else None
+    return {} if solution is None else leverages(solution)
+
+
+def spans_of(c: CalibrationData) -> list[tuple[float, float, float]]:
+    """Return first and last stamp, s, of what counts of this drive, and its share."""
+    shares, scenes = _shares(c), c.material.scenes if c.material else {}
+    return [(*(scenes[turn].tracks.stamps_ns[[0, -1]] / 1e9).tolist(), share)
+            for turn, share in sorted(shares.items()) if turn.of_this_drive and turn in scenes]
 
 
 def names(c: CalibrationData) -> dict[TurnId, str]:
@@ -137,14 +149,15 @@ def _alone_text(fx: float, sigma: float, share: float) -> str:
 
 
 def turn_rows(c: CalibrationData) -> list[dict[str, str]]:
-    """Return the table of all turns: name, time, frames, yaw, keyframes, error, why unused."""
-    short = names(c)
+    """Return the table of all turns: when, what each gave, and why it is unused."""
+    short, shares = names(c), _shares(c)
     apart = {each.turn: f'{each.px:.3g} px, {each.sigmas:.1f} sigmas' for each in c.held_out}
     rows = []
     for turn in c.all_turns:
         row = {'turn': short[turn.id], 'at': getattr(turn, 'clip', '') or 'earlier', 'frames': '-',
                'yaw': optional(turn.yaw_deg, 0, '°'), 'keyframes': str(turn.images),
                'error': optional(turn.reprojection_error_px, 2, ' px'),
+               'of fx': f'{100 * shares[turn.id]:.0f} %' if turn.id in shares else '-',
                'held out': apart.get(turn.id, '-'),
                'used': 'used' if turn.used else f'no: {turn.unused_because or "not needed"}'}
         if isinstance(turn, TurnSummary):

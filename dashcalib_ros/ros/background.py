@@ -320,7 +320,9 @@ class Learner:
     def _look(self, bank: _Bank) -> None:
         """See which turns are built now."""
         try:
-            bank.calibrator.scenes.want(self._goal.config.turns.wanted, self._more)
+            # a camera in use is compared with turns: a stabiliser can hide no turn
+            bank.calibrator.scenes.want(self._goal.config.turns.wanted, self._more,
+                                        self._goal.camera is None and self._goal.check is None)
             status = bank.calibrator.status()
         except Exception as error:
             self._hear(Trouble('failed', f'the turns could not be counted: {_error_text(error)}'))
@@ -383,9 +385,12 @@ class Learner:
         goal = self._goal
         if goal.check is not self._tried_with:
             self._tried_with, bank.tried = goal.check, frozenset()
-        ready = self.activity.status.ready
-        news = (goal.turns is not None and len(ready) >= goal.turns
-                and not bank.tried.issuperset(ready))
+        status = self.activity.status
+        count = len(status.ready) + len(status.stretches)
+        # a calibration takes its time: one new turn is worth it, one new stretch is not
+        news = goal.turns is not None and count >= goal.turns and (
+            not bank.tried.issuperset(status.ready)
+            or len(set(status.stretches) - bank.tried) >= goal.turns)
         return (bank.number == self.bank and (bank.requested or news)
                 and time.monotonic() >= bank.not_before)
 
@@ -461,24 +466,30 @@ def new_turns(logged: Set[TurnId], now: Status, wanted: int, checking: bool) -> 
     return lines
 
 
-def seen(status: Status, needed: int) -> str:
+def seen(status: Status, needed: int, sigma: float | None = None) -> str:
     """Return what turns there are, and how many are missing, for who drives.
 
-    needed: turns with which a calibration begins.
+    needed: turns with which a calibration begins. sigma: of fx, of it, by those so far.
     """
     ways = Counter(status.ways)
     kinds = [counted(ways[way], name) for way, name in WAYS.items() if ways[way]]
-    text = f'{", ".join(kinds)}, {status.yaw_deg:.0f}° in all' if kinds else 'no turn yet'
+    kinds = [f'{", ".join(kinds)}, {status.yaw_deg:.0f}° in all' if kinds else 'no turn yet']
+    kinds += [counted(count, name) for count, name in (
+        (status.bends, 'bend'), (len(status.stretches) - status.bends, 'straight piece'))
+        if count]
+    text = ', '.join(kinds) + (f'; fx ± {100 * sigma:.2g} % so far' if sigma else '')
     missing = needed - status.built
     return f'{text}; {counted(missing, "more turn")} needed' if missing > 0 else text
 
 
 def beginning(status: Status) -> str:
     """Return the line about a calibration that begins."""
-    if not status.built:
+    if not status.built and not status.stretches:
         return (f'calibrating, as soon as {counted(status.turns, "turn")} found so far can be '
                 f'used…')
-    return f'calibrating with {counted(status.built, "turn")}, {status.yaw_deg:.0f}° of yaw…'
+    more = len(status.stretches)
+    return (f'calibrating with {counted(status.built, "turn")}, {status.yaw_deg:.0f}° of yaw'
+            + (f', and {counted(more, "other piece")} of the drive' if more else '') + '…')
 
 
 def _error_text(error: Exception) -> str:

@@ -103,6 +103,8 @@ class Drive:
         # own sensors say of the last calibration
         self._moved = ''
         self._witnesses: list[str] = []
+        # of fx, of it, by the last calibration; None where it has none
+        self._sigma: float | None = None
         # by those who wait for a calibration
         self._asked: list[Future] = []
         endpoints.at_end(self._answer, False, 'the node was stopped')
@@ -139,7 +141,7 @@ class Drive:
 
     def forget(self, keep_stored: bool = False) -> None:
         """Forget the turns; keep_stored: not those in turns.store."""
-        self.verdict, self._witnesses = None, []
+        self.verdict, self._witnesses, self._sigma = None, [], None
         self.learner.restart(keep_stored)
         self._intake.forget()
         self._answer(False, 'the turns were dropped meanwhile')
@@ -319,7 +321,9 @@ class Drive:
         if self.held:  # nobody knows of which camera it is
             self._answer(False, self.held)
             return
-        self.verdict = result.calibration.verdict
+        found = result.calibration
+        self.verdict, self._sigma = found.verdict, (
+            found.sigma['fx'] / found.camera.fx if found.camera and found.sigma else None)
         self._witnesses = witness_texts(result.calibration.witnesses)
         for text in self._witnesses:
             self._log.info(text)
@@ -334,7 +338,8 @@ class Drive:
     def turns_text(self) -> str:
         """Return what turns there are for the next calibration and how many are missing."""
         goal = self._goal
-        return seen(self.learner.activity.status, goal.turns or goal.config.turns.wanted)
+        return seen(self.learner.activity.status, goal.turns or goal.config.turns.wanted,
+                    self._sigma if goal.camera is None else None)
 
     def _tick(self) -> None:
         self.catch_up()
@@ -362,6 +367,9 @@ class Drive:
             'turns built': now.built,
             'turns wanted': wanted,
             'yaw (deg)': f'{now.yaw_deg:.0f}',
+            'bends': now.bends,
+            'straight pieces': len(now.stretches) - now.bends,
+            'sigma fx so far (%)': f'{100 * self._sigma:.2g}' if self._sigma else '',
             'percent': min(100, round(100 * now.built / wanted)),
             'turning magnitude': f'{now.magnitude:.4f}',
             'standing': now.standing,

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dashcalib_ros.detect.detector import MIN_PROMINENCE
 from dashcalib_ros.detect.stretches import LEAST_S, StretchBank
-from dashcalib_ros.detect.turn import Turn
+from dashcalib_ros.detect.turn import MIN_PROMINENCE, Turn
 from dashcalib_ros.input import Frame
 
 RATE = 10
@@ -19,9 +18,9 @@ def turn(first: int, last: int) -> Turn:
 
 
 def bank_of(swings: list[float], turns: tuple[Turn, ...] = (), capacity: int = 3,
-            gaps: tuple[int, ...] = ()) -> StretchBank:
+            gaps: tuple[int, ...] = (), keep=list) -> StretchBank:
     """Return the bank after a drive of tiles of 6 s that swing so far, of the width."""
-    bank = StretchBank(capacity, 6.0, lambda: turns)
+    bank = StretchBank(capacity, 6.0, lambda: turns, keep)
     for index in range(6 * RATE * len(swings)):
         swing = swings[index // (6 * RATE)]
         bank.push(Frame(index, index * 10**9 // RATE, IMAGE),
@@ -59,9 +58,22 @@ def test_images_can_be_freed_and_none_is_kept_without_a_place():
     assert bank_of([0.04], capacity=0).stretches() == ()
 
 
+def test_a_live_drive_keeps_the_images_of_one_until_they_are_taken():
+    bank = bank_of([0.01, 0.04, 0.0, 0.03, 0.02], keep=None)
+    [best] = bank.stretches()
+    assert best.frames and best.center // (6 * RATE) == 1
+    bank.exchange(best.center, ())
+    for index in range(300, 420):
+        bank.push(Frame(index, index * 10**9 // RATE, IMAGE), (0.001 * (index % 7), 0.0), False)
+    bank.finish()
+    assert len(bank.stretches()) > 1 and sum(bool(each.frames) for each in bank.stretches()) == 1
+    bank.want(False)
+    assert not any(each.frames for each in bank.stretches())
+
+
 @pytest.mark.parametrize('seconds', [2, 3])
 def test_short_drives_have_none(seconds):
-    bank = StretchBank(3, 6.0, tuple)
+    bank = StretchBank(3, 6.0, tuple, list)
     for index in range(seconds * RATE):
         bank.push(Frame(index, index * 10**9 // RATE, IMAGE), (0.01, 0.0), False)
     bank.finish()

@@ -13,9 +13,10 @@ from scipy.signal import find_peaks
 
 from dashcalib_ros.config import TurnsConfig
 from dashcalib_ros.detect import TurnDetector
-from dashcalib_ros.detect.detector import CUT_OFF, MIN_PROMINENCE, SEEN, History
+from dashcalib_ros.detect.detector import CUT_OFF, SEEN, History
 from dashcalib_ros.detect.estimator import Motion
 from dashcalib_ros.detect.peaks import PeakFinder, StreamingMedian
+from dashcalib_ros.detect.turn import MIN_PROMINENCE
 from dashcalib_ros.input import Frame
 
 TINY = np.zeros((2, 2), np.uint8)

@@ -113,6 +113,33 @@ def test_one_clip_with_many_turns_does_not_decide_the_size():
     assert shares['many.npz'].left_out.startswith('is 640x450')
 
 
+# stretches of ten clips, with less yaw than a turn
+GENTLE = {f's{n}.mp4': clip_of(yaws=((-1)**n * (9.0 + n / 2),), world=80 + n, prominence=0.001,
+                               tracks=140, keyframes=12) for n in range(8)}
+
+
+def test_clips_without_a_turn_add_up_by_the_rules_of_a_drive():
+    unknown = fuse('cam', '', GENTLE, CONFIG)
+    assert unknown.calibration.verdict.level == 'weak'
+    assert 'E-ONLY-GENTLE' in unknown.calibration.verdict.codes and not unknown.estimate.sound
+    known = fuse('cam', '', GENTLE, CONFIG.replace({'known.stabiliser': 'no'}))
+    found = known.calibration
+    assert found.verdict.level == 'accepted' and found.turns_used == len(GENTLE)
+    assert abs(found.camera.fx - LENS.fx) < 2 * found.sigma['fx']
+    so_far = [known.shares[name].sigma_so_far for name in sorted(GENTLE)]
+    assert so_far[-1] == pytest.approx(found.sigma['fx']) and so_far[-1] < so_far[1] < so_far[0]
+    assert found.sigma['fx'] < unknown.estimate.sigma['fx']
+
+
+def test_no_stretch_takes_the_place_of_a_turn():
+    both = {**CLIPS, **dict(list(GENTLE.items())[:2])}
+    enough = CONFIG.replace({'turns.wanted': 4})
+    assert fuse('cam', '', both, enough).calibration.turns_used == 4
+    assert fuse('cam', '', both, CONFIG).calibration.turns_used == 6
+    few = fuse('cam', '', both, CONFIG.replace({'fleet.turns': 4}))
+    assert [few.shares[name].used for name in sorted(both)] == [1] * 4 + [0] * 2
+
+
 def test_the_others_give_one_camera(fused):
     found = fused.calibration
     assert found.verdict.level == 'accepted' and found.turns_used == 4 and fused.estimate.sound

@@ -9,6 +9,7 @@ import pytest
 from fleet_made import CONFIG, clip_of, written
 from made_drives import smooth, write_folder, write_video
 
+from dashcalib_ros.detect.turn import is_turn
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.fleet import clips
 from dashcalib_ros.fleet.clips import content_hash, gather, gather_clip, settings_hash
@@ -76,6 +77,27 @@ def test_pictures_that_changed_are_read_again(tmp_path, how):
     # the same names, sizes and dates
     after = gathered(folder, tmp_path / 'out')
     assert not after.again and after.content != before.content and after.file != before.file
+
+
+@pytest.mark.parametrize(('yaw_deg', 'thorough', 'stretches'), [
+    (80.0, False, 0), (30.0, False, 1), (80.0, True, 1)])
+def test_other_stretches_are_gathered_where_no_turn_is_sharp(
+        shared_drive, tmp_path, monkeypatch, yaw_deg, thorough, stretches):
+    scene = clip_of(yaws=(yaw_deg,), tracks=60, keyframes=8).turns[0].scene
+    tried = []
+
+    def reconstructed(turn, config, valid):
+        tried.append(turn)
+        assert turn.frames
+        return replace(scene, turn=turn.id)
+
+    monkeypatch.setattr(clips, 'reconstruct', reconstructed)
+    folder = write_folder(tmp_path / 'images', shared_drive.frames())
+    config = CONFIG.replace({'turns.thorough': thorough, 'turns.half_width': 1.6})
+    found = gather(folder, 'f' * 32, shared_drive.spec.rate, None, config)
+    few = sum(not is_turn(turn.prominence) for turn in found.turns)
+    assert bool(few) == bool(stretches) and found.found == len(found.turns) == len(tried)
+    assert encoded(decoded(encoded(found))) == encoded(found)
 
 
 def test_what_changes_while_it_is_read_is_not_kept(tmp_path, monkeypatch):

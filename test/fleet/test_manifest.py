@@ -32,6 +32,18 @@ def test_a_csv_names_clips_relative_to_itself(tmp_path):
         'cam': 2, '/abs/2.mp4': 1}
 
 
+def test_what_is_known_of_a_camera_stands_in_its_rows(tmp_path):
+    rows = rows_of(tmp_path, 'clip,camera,known\na.mp4,a,stabiliser=no fx=1160+-20\n'
+                             'b.mp4,a,"aspect=1; shutter=24 ms"\nc.mp4,a,fx=1160±20\nd.mp4,a\n'
+                             'e.mp4,b,fx=900±9\nf.mp4,b,fx=700±9\ng.mp4,c,fx=9\nh.mp4,c,lens=1\n')
+    first, second, _ = cameras_of(rows)
+    assert first.known == {'known.stabiliser': 'no', 'known.fx': '1160±20', 'known.aspect': '1',
+                           'known.shutter': '24 ms'}
+    # nobody knows which of two is right
+    assert second.known == {}
+    assert [bool(row.problem) for row in rows] == [False] * 6 + [True] * 2
+
+
 @pytest.mark.parametrize(('values', 'problem'), [
     ('a.mp4,cam,nine', 'fps must be above 0'), ('a.mp4,cam,-1', 'fps must be'),
     ('a.mp4,cam,nan', 'fps must be'), (',cam,10', 'names no clip'),

@@ -87,6 +87,9 @@ def test_every_unused_turn_has_its_reason(drawn, text):
         None, None, None, 'it was too dark', 'more prominent turns were enough']
     held_out = re.findall(r'data-name="held out"[^>]*>([^<]*)<', text)
     assert [each != '-' for each in held_out] == [True] * 3 + [False] * 2
+    shares = re.findall(r'data-name="of fx"[^>]*>([^<]*)<', text)
+    assert [each != '-' for each in shares] == [True] * 3 + [False] * 2
+    assert sum(int(each[:-2]) for each in shares[:3]) == pytest.approx(100, abs=2)
     assert text.count('no: it was too dark') == text.count('not used: it was too dark') == 1
 
 

@@ -115,6 +115,15 @@ def test_nothing_to_plot_gives_no_plot(values):
     assert magnitude_svg(np.array(values, float).reshape(-1, 2), ()) == ''
 
 
+def test_what_counts_is_a_bar_as_high_as_its_share():
+    magnitudes = np.column_stack([np.arange(100.0, 120.0), np.linspace(0, 0.01, 20)])
+    svg = magnitude_svg(magnitudes, (), None, [(100.0, 106.0, 0.25), (110.0, 116.0, 0.5)])
+    bars = [[float(value) for value in found] for found in re.findall(
+        r'class="band" x="([^"]*)" y="[^"]*" width="([^"]*)" height="([^"]*)"', svg)]
+    assert bars[1][2] == pytest.approx(2 * bars[0][2], abs=0.2) and bars[1][0] > bars[0][0]
+    assert bars[0][1] == pytest.approx(bars[1][1], abs=0.2)
+
+
 def test_equal_stamps_and_a_flat_signal_plot_too():
     assert 'class="signal" d="M' in magnitude_svg(np.zeros((3, 2)), ())
 

@@ -94,7 +94,7 @@ class Scenes:
     def forget_stored(self, but=frozenset()):
         pass
 
-    def want(self, turns, more=0):
+    def want(self, turns, more=0, stretches=True):
         pass
 
     def exclude(self, reasons, keep_files=False):

@@ -122,7 +122,7 @@ class Core:
 class Scenes:
     """In the SceneSelection's place: of such a core."""
 
-    def want(self, turns, more=0):
+    def want(self, turns, more=0, stretches=True):
         self.core.wanted = turns + more
 
     def exclude(self, reasons, keep_files=False):

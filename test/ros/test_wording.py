@@ -2,6 +2,8 @@
 """What the node says while it learns, one line for each event: no ROS needed."""
 from __future__ import annotations
 
+from dataclasses import replace
+
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.judge import TurnSummary, Verdict
@@ -42,6 +44,9 @@ def test_who_drives_reads_which_turns_there_are_and_how_many_are_missing():
     some = status((A, 90.0), (B, 60.4), (C, 30.0), ways=(RIGHT, LEFT, RIGHT))
     assert seen(some, 4) == '2 right turns, 1 left turn, 180° in all; 1 more turn needed'
     assert seen(status((A, 90.0), ways=(BACK,)), 1) == '1 S-bend, 90° in all'
+    gentle = replace(status(), stretches=(A, B, TurnId.at(9)), bends=1)
+    assert seen(gentle, 5, 0.0123) == (
+        'no turn yet, 1 bend, 2 straight pieces; fx ± 1.2 % so far; 5 more turns needed')
     assert lines(set(), status((A, 90.0), ways=(LEFT,))) == [
         'turn 1 of 5: 90° to the left, 90° in all']
 
