@@ -317,13 +317,14 @@ def _without_points(linear: Linear, radius: float) -> tuple[Floats, Floats]:
     small = 1e-9 * np.trace(linear.points, axis1=1, axis2=2)[:, None] + 1e-12
     if radius < np.inf:
         small = damping(np.einsum('tii->ti', linear.points), radius)
-    inverse = np.linalg.inv(linear.points + small[:, :, None] * np.eye(POINT))
-    root = np.linalg.cholesky(inverse).transpose(2, 1, 0)
+    # of the inverse itself the rounding of a point that is nearly undetermined leaves no root
+    root = np.linalg.inv(np.linalg.cholesky(linear.points + small[:, :, None] * np.eye(POINT)))
+    inverse = root.transpose(0, 2, 1) @ root
     for chunk, mixed in zip(linear.seen.observed.chunks, linear.mixed, strict=True):
-        factor = root[:, :, chunk.points]
+        factor = root[chunk.points].transpose(1, 2, 0)
         part = np.concatenate([
-            factor[0, 0] * mixed[0] + factor[0, 1] * mixed[1] + factor[0, 2] * mixed[2],
-            factor[1, 1] * mixed[1] + factor[1, 2] * mixed[2], factor[2, 2] * mixed[2]], axis=1)
+            factor[0, 0] * mixed[0], factor[1, 0] * mixed[0] + factor[1, 1] * mixed[1],
+            factor[2, 0] * mixed[0] + factor[2, 1] * mixed[1] + factor[2, 2] * mixed[2]], axis=1)
         squares, width = part @ part.T, own * (chunk.end - chunk.begin)
         low, high = own * chunk.begin, own * chunk.end
         whole[low:high, low:high] -= squares[:width, :width]
