@@ -42,8 +42,9 @@ from dashcalib_ros.ros.parameters import declare, declared_names, given_paramete
 from dashcalib_ros.ros.settings import CHANGEABLE, NodeConfig, sample, specs
 
 COLCON = shutil.which('colcon')
-# one drive, and the node, have no use for a fleet's settings
-CORE = {name: value for name, value in Config().flat().items() if not name.startswith('fleet.')}
+# one drive, and the node, have no use for the settings of a fleet and of a rig
+CORE = {name: value for name, value in Config().flat().items()
+        if not name.startswith(('fleet.', 'rig.'))}
 
 
 @pytest.fixture(scope='module')
