@@ -1,21 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rigs with known truth: how far each camera's place is off, in its unit and in sigmas.
 
-python benchmark/rig.py [KIND ...] [--seeds N] [--turns N] [--cache DIR] [--real FOLDER]
+    python benchmark/rig.py [--kinds KIND ...] [--seeds 0-9] [--turns N] [--cache DIR]
+                            [--real FOLDER] [--results]
 
 Rendered rigs have exact truth; of the real pair (FOLDER has left/ and right/) the epipolar
 geometry of matches that nothing was fitted to is the witness.
 """
 from __future__ import annotations
 
-import argparse
-import os
 import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from measure import parser_with
+from result_tables import keep_table
 
 from dashcalib_ros.camera.rotation import rotation_vectors
 from dashcalib_ros.demo import RIGS, render_to_bag, rig_drives, true_places
@@ -24,16 +25,10 @@ from dashcalib_ros.input.motion import Samples, SensorStream
 from dashcalib_ros.rig_session import calibrate_rig
 from dashcalib_ros.workers.worker import one_thread_for_numpy
 
-TABLE = Path(__file__).parent / 'results' / 'rig.md'
-HEAD = """# Rigs
-
-Written by `python benchmark/rig.py`. Errors of rotations are about the camera's axes x, y, z;
-sigma is that of rig.json. Translations with the car's true speed.
-
+HEAD = """\
 | rig | seed | turns | camera | verdict | rotation off, degrees | its sigma | worst, sigmas | \
 lever off, cm (visible axes) | clock off, ms | s |
-|---|---|---|---|---|---|---|---|---|---|---|
-"""
+|---|---|---|---|---|---|---|---|---|---|---|"""
 
 
 def rendered(kind: str, seed: int, turns: int, cache: Path) -> list[str]:
@@ -91,18 +86,16 @@ def _text(values: np.ndarray) -> str:
 
 def main() -> None:
     """Measure, and write the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('kinds', nargs='*', default=list(RIGS))
-    parser.add_argument('--seeds', type=int, default=1)
+    parser = parser_with(__doc__, 'seeds', seeds=[0])
+    parser.add_argument('--kinds', nargs='+', default=list(RIGS))
     parser.add_argument('--turns', type=int, default=3)
     parser.add_argument('--cache', type=Path, default=Path(tempfile.gettempdir()) / 'rigs')
     parser.add_argument('--real', type=Path)
     args = parser.parse_args()
-    rows = [row for kind in args.kinds for seed in range(args.seeds)
+    rows = [row for kind in args.kinds for seed in args.seeds
             for row in rendered(kind, seed, args.turns, args.cache)]
     lines = [] if args.real is None else real(args.real)
-    TABLE.write_text(HEAD + os.linesep.join([*rows, *lines]) + os.linesep)
-    print(TABLE.read_text())
+    keep_table('rig', '\n'.join([HEAD, *rows, *lines]), args)
 
 
 if __name__ == '__main__':

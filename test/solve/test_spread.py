@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from solving import CONFIG, only, scenes_of, solved
+from solving import only, scenes_of, solved
 from synthetic import LENS
 
 from dashcalib_ros.camera import Brown
@@ -134,8 +134,7 @@ def test_what_makes_a_cost_soft_is_in_its_covariance():
 
 @pytest.fixture(scope='module')
 def solution() -> Solution:
-    return solved(scenes_of(2, tracks=110, keyframes=12),
-                  CONFIG.replace({'intrinsics.profile_tracks': 20}))
+    return solved(scenes_of(2))
 
 
 def test_a_measurement_draws_the_camera_as_far_as_it_is_known(solution):
