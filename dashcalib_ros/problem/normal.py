@@ -280,12 +280,8 @@ class PosesGivenShared:
 
 def poses_given_shared(linear: Linear, variance: float) -> PosesGivenShared:
     """Return what a stretch without blocks of images says of its poses; variance: px^2."""
-    whole, _ = _without_points(linear, np.inf)
+    whole, _ = linear.without_points
     poses, count = linear.extras['pose'], POSE * len(linear.images)
-    if linear.follow is not None:
-        motion = linear.extras['motion']
-        whole[:, poses] += whole[:, motion] @ linear.follow
-        whole[poses] += linear.follow.T @ whole[motion]
     inner, shared = whole[np.ix_(poses, poses)], whole[poses, linear.own * len(linear.images):-1]
     right = np.concatenate([variance * np.eye(count), shared], axis=1)
     solved = _pose_solution(inner, right, linear.stretch)

@@ -21,7 +21,13 @@ from dashcalib_ros.problem.blocks import (
     bounds_of,
     imaging_with,
 )
-from dashcalib_ros.problem.normal import Normal, linearised, noise_of, normal_equations
+from dashcalib_ros.problem.normal import (
+    Normal,
+    linearised,
+    noise_of,
+    normal_equations,
+    poses_given_shared,
+)
 from dashcalib_ros.problem.quadratic import Quadratic
 from dashcalib_ros.reconstruct.scene import Scene, residuals_px
 from dashcalib_ros.solve.optimise import Estimate, optimised
@@ -45,6 +51,21 @@ def residuals(scene: Scene, imaging: Imaging) -> np.ndarray:
 
 def normal_of(scene: Scene, imaging: Imaging, loss_px: float, **options) -> Normal:
     return normal_equations(linearised(imaging.seen(scene), loss_px), **options)
+
+
+@pytest.mark.parametrize('readout_s', [0.0, READOUT_S])
+def test_poses_follow_what_is_shared_as_the_normal_equations_say(readout_s):
+    scene = small_scene(LENS)
+    linear = linearised(Imaging.of(Lens(LENS), Readout(np.array([readout_s]))).seen(scene), 1.0)
+    assert (linear.follow is None) == (not readout_s)
+    known, normal = poses_given_shared(linear, VARIANCE), normal_equations(linear)
+    np.testing.assert_allclose(known.follow, -normal.response, rtol=1e-8, atol=1e-12)
+    # one sigma of the noise is what the scores of the poses are worth
+    score = np.random.default_rng(2).normal(size=len(known.covariance))
+    moved = known.covariance @ score
+    assert score @ moved > 0
+    twice = poses_given_shared(linear, 2 * VARIANCE).covariance
+    np.testing.assert_allclose(twice, 2 * known.covariance, rtol=1e-8, atol=1e-15)
 
 
 def as_seen(scene: Scene, imaging: Imaging, noise_px: float = 0.02) -> Scene:
