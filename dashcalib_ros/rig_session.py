@@ -133,12 +133,12 @@ def rig_of_drives(drives: Mapping[str, Recording], base: str | None = None,
         paths = again.paths(pool, observer)
         matches = again.matches(pool)
     observer.show('placing the cameras', None)
-    problem = problem_of(paths, base, kept, _metres(learned, base))
+    metres = _metres(learned[base])
+    problem = problem_of(paths, base, kept, metres)
     best = solved(problem) if problem.pairs else None
     calibrations = {name: each.calibration if best is None else _refined(each, best, name)
                     for name, each in learned.items()}
     levels = {name: each.calibration.verdict.level for name, each in learned.items()}
-    metric = _metres(learned, base) is not None
     cameras: dict[str, PlacedCamera] = {}
     witness: Mapping[tuple[str, str], Epipolar] = {}
     if best is not None:
@@ -151,7 +151,7 @@ def rig_of_drives(drives: Mapping[str, Recording], base: str | None = None,
                 name, base, turned[name], len(found[name].scenes)))
         else:
             cameras[name] = placed(
-                name, place(name), levels[name], best, metric,
+                name, place(name), levels[name], best, metres is not None,
                 learned[name].start_s - learned[base].start_s, config.rig, doubts.get(name, ()))
     return Rig(RigCalibration(base, cameras, witness), calibrations)
 
@@ -342,9 +342,8 @@ def _refined(each: Learned, best: Solved, name: str) -> Calibration:
         sigma=dict(zip(camera.names(), np.sqrt(np.diag(covariance)).tolist(), strict=True)))
 
 
-def _metres(learned: Mapping[str, Learned], base: str) -> Metres | None:
-    """Return how far the car goes, where any of the drives has a speed."""
-    each = learned[base]
+def _metres(each: Learned) -> Metres | None:
+    """Return the speed of the car, where the drive has one."""
     if each.drive.motion is None:
         return None
     speed = speeds_of(each.drive.motion.since(each.start_s))

@@ -21,6 +21,17 @@ def rotation_vectors(matrices: Floats) -> Floats:
     return np.array([cv2.Rodrigues(matrix)[0][:, 0] for matrix in matrices]).reshape(-1, 3)
 
 
+def nearest_rotation(matrix: Floats) -> Floats:
+    """Return the rotation (3, 3) that a matrix (3, 3) is nearest to: Kabsch's, of A' B."""
+    u, _, v = np.linalg.svd(matrix)
+    return np.asarray(u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ v))]) @ v)
+
+
+def centres_of(rotations: Floats, translations: Floats) -> Floats:
+    """Return where cameras are (n, 3), of poses (n, 3, 3), (n, 3) from the world to them."""
+    return np.asarray(-np.einsum('nji,nj->ni', rotations, translations))
+
+
 def quaternion(matrix: Floats) -> tuple[float, float, float, float]:
     """Return a rotation matrix (3, 3) as (x, y, z, w), as ROS has it."""
     from scipy.spatial.transform import Rotation

@@ -284,8 +284,8 @@ def _undistorted(camera: Camera) -> Floats:
 
 # s: most dashcams have a rolling shutter, of 10 to 30 ms
 READOUT_SIGMA_S = 0.02
-# prior sigmas of how much faster a camera turns than the spline says: about the axis of the turn,
-# and about the others (3 degrees a second)
+# prior sigmas of how fast a camera turns: about the axis of the turn, beyond what the spline says,
+# and about the others in all (3 degrees a second)
 STEERING_RAD_S, BUMPS_RAD_S = 0.005, 0.05
 # degrees: bumps turn a camera by less
 STEERED_DEG = 15.0
@@ -309,11 +309,11 @@ class Readout(SharedBlock):
 
 @dataclass(frozen=True)
 class Shake(ImageBlock):
-    """By how much each camera turns more, rad from the first row to the last, than the spline.
+    """By how much each camera turns, rad from the first row to the last, beyond its steering.
 
-    As bumps make it. axes: by stretch (3,) about which the car turns, in the camera's axes.
-    readout_s: at which the prior is taken; a step does not change it, or a longer readout would
-    make the same shaking likelier.
+    As bumps make it; Imaging.steering has the rest. axes: by stretch (3,) about which the car
+    turns, in the camera's axes. readout_s: at which the prior is taken; a step does not change it,
+    or a longer readout would make the same shaking likelier.
     """
 
     axes: Mapping[TurnId, Floats] = field(default_factory=dict)
@@ -617,8 +617,8 @@ class Imaging:
     def steering(self, stretch: Stretch) -> Floats:
         """Return the (3, 3) projection of how the camera turns on what the poses can say of it.
 
-        About the axis of turns alone where Shake is free: a camera that bumps shake turns about
-        the others several times between two keyframes, and their difference is another speed.
+        With Shake, about the axis of turns alone: between two keyframes bumps turn a camera to and
+        fro about the other axes, so the difference of the poses does not say how fast.
         """
         shake = self.blocks.get(Shake.name)
         axis = shake.axes.get(stretch.turn) if isinstance(shake, Shake) else None

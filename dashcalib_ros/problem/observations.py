@@ -13,7 +13,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats, Ints, Mask
 from dashcalib_ros.camera.field import field_terms
-from dashcalib_ros.camera.rotation import rotation_vectors
+from dashcalib_ros.camera.rotation import centres_of, rotation_vectors
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.problem.trajectory import Trajectory
 
@@ -65,7 +65,7 @@ class Structure:
     def path(self) -> tuple[Floats, Floats]:
         """Return the rotations (n, 3, 3) and the centres (n, 3) of the n registered images."""
         rotations = self.rotations[self.registered]
-        return rotations, -np.einsum('kji,kj->ki', rotations, self.translations[self.registered])
+        return rotations, centres_of(rotations, self.translations[self.registered])
 
 
 @dataclass(frozen=True)

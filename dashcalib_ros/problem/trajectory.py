@@ -13,6 +13,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Ints, Mask
+from dashcalib_ros.camera.rotation import centres_of
 
 # knots at the least, from which a spline says how the camera moved
 LEAST_KNOTS = 4
@@ -43,8 +44,9 @@ class Trajectory:
                    len(rows) >= LEAST_KNOTS and bool(np.all(np.diff(seconds) > 0)))
 
     @cached_property
-    def _centres(self) -> Floats:
-        return np.asarray(-np.einsum('kji,kj->ki', self.rotations, self.translations))
+    def centres(self) -> Floats:
+        """Return (k, 3) where the camera is at the knots."""
+        return centres_of(self.rotations, self.translations)
 
     @cached_property
     def _relative(self) -> Floats:
@@ -62,7 +64,7 @@ class Trajectory:
         if self.moves:
             slopes = _slopes(tuple(self.seconds.tolist()))
             turning[self.rows] = np.einsum('kj,kjc->kc', slopes, self._angles)
-            moving[self.rows] = -np.einsum('kab,kb->ka', self.rotations, slopes @ self._centres)
+            moving[self.rows] = -np.einsum('kab,kb->ka', self.rotations, slopes @ self.centres)
         return turning, moving
 
     def later(self, seconds: float) -> Trajectory:
@@ -78,7 +80,7 @@ class Trajectory:
         weights = _weights(tuple(self.seconds.tolist()), seconds)
         rotations = exponentials(np.einsum(
             'nk,nkc->nc', weights, self._angles[near])) @ self.rotations[near]
-        return rotations, -np.einsum('nab,nb->na', rotations, weights @ self._centres)
+        return rotations, -np.einsum('nab,nb->na', rotations, weights @ self.centres)
 
     def by_knots(self, seconds: Floats) -> Floats:
         """Return (n, 6, k, 6) derivatives of the poses at times (n,) by the moves of the k knots.
@@ -87,16 +89,11 @@ class Trajectory:
         """
         near = np.abs(seconds[:, None] - self.seconds).argmin(axis=1)
         weights, each = _weights(tuple(self.seconds.tolist()), seconds), np.arange(len(near))
-        angles = self._angles[near]
-        angle = np.einsum('nk,nkc->nc', weights, angles)
+        angle = np.einsum('nk,nkc->nc', weights, self._angles[near])
         turned, (rotations, translations) = exponentials(angle), self.at(seconds)
         by_knots = np.zeros((len(near), 6, len(self.seconds), 6))
-        crossed = cross(angles.reshape(-1, 3)).reshape(*weights.shape, 3, 3)
-        by_turn = weights[:, :, None, None] * (np.eye(3) - crossed / 2 + crossed @ crossed / 12)
-        by_angle = by_turn.transpose(0, 2, 1, 3).copy()
-        by_angle[each, :, near] -= np.sum(by_turn @ self._relative[near], axis=1)
         left = np.eye(3) + cross(angle) / 2
-        by_knots[:, :3, :, :3] = np.einsum('nab,nbjc->najc', left, by_angle)
+        by_knots[:, :3, :, :3] = np.einsum('nab,nbjc->najc', left, self._by_turns(weights, near))
         by_knots[each, :3, near, :3] += turned
         # of minus the centre, in the world's axes, by each knot's move
         back = self.rotations.transpose(0, 2, 1)
@@ -111,7 +108,7 @@ class Trajectory:
         if self.moves:
             slopes, each = _slopes(tuple(self.seconds.tolist())), np.arange(len(self.seconds))
             inner = np.zeros((len(each), 6, len(each), 6))
-            inner[:, :3, :, :3] = self._by_turns(slopes)
+            inner[:, :3, :, :3] = self._by_turns(slopes, each)
             # [k, j]: from the axes of knot j to those of k
             weighted = slopes[:, :, None, None] * self._relative.transpose(0, 1, 3, 2)
             inner[:, 3:, :, 3:] = weighted.transpose(0, 2, 1, 3)
@@ -120,13 +117,13 @@ class Trajectory:
             found[np.ix_(self.rows, np.arange(6), self.rows, np.arange(6))] = inner
         return found
 
-    def _by_turns(self, weights: Floats) -> Floats:
-        """Return (k, 3, k, 3) derivatives of weighted (k, k) angles from each knot, by turns."""
-        turned = cross(self._angles.reshape(-1, 3)).reshape(*weights.shape, 3, 3)
+    def _by_turns(self, weights: Floats, near: Ints) -> Floats:
+        """Return (n, 3, k, 3) derivatives of weighted (n, k) angles from knots (n,), by turns."""
+        turned = cross(self._angles[near].reshape(-1, 3)).reshape(*weights.shape, 3, 3)
         # of the vector of a rotation by one more small rotation, to the third order; gauge-free
         by_turn = weights[:, :, None, None] * (np.eye(3) - turned / 2 + turned @ turned / 12)
         found, each = by_turn.transpose(0, 2, 1, 3).copy(), np.arange(len(weights))
-        found[each, :, each] -= np.sum(by_turn @ self._relative, axis=1)
+        found[each, :, near] -= np.sum(by_turn @ self._relative[near], axis=1)
         return np.asarray(found)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats, GreyImage, Mask, Pixels
 from dashcalib_ros.camera import Camera
+from dashcalib_ros.camera.rotation import centres_of
 from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.problem.observations import Stretch, Tracks, main_axis
 
@@ -122,7 +123,7 @@ def _least_eigenvectors(matrices: Floats) -> Floats:
 
 def _widest_angle(rotations: Floats, translations: Floats, points: Floats, seen: Mask) -> Floats:
     """Return (t,) the angle in radians between the first and the last ray of each track."""
-    centres = -np.einsum('kji,kj->ki', rotations, translations)
+    centres = centres_of(rotations, translations)
     first = seen.argmax(axis=0)
     last = len(seen) - 1 - seen[::-1].argmax(axis=0)
     a, b = points - centres[first], points - centres[last]

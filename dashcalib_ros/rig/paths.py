@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Mask
+from dashcalib_ros.camera.rotation import centres_of
 from dashcalib_ros.problem.normal import linearised, poses_given_shared
 from dashcalib_ros.problem.steps import State
 from dashcalib_ros.problem.trajectory import Trajectory, logarithms
@@ -45,8 +46,7 @@ class ScenePath:
     @property
     def centres(self) -> Floats:
         """Return (k, 3) where the camera was."""
-        path = self.trajectory
-        return np.asarray(-np.einsum('kji,kj->ki', path.rotations, path.translations))
+        return self.trajectory.centres
 
     def within(self, seconds: Floats) -> Mask:
         """Return whether times (n,) are between the first and the last keyframe."""
@@ -58,7 +58,7 @@ class ScenePath:
         From each of the times (n,) to the next, in the camera's axes at the first of both.
         """
         rotations, translations = self.trajectory.at(seconds)
-        centres = -np.einsum('nji,nj->ni', rotations, translations)
+        centres = centres_of(rotations, translations)
         turned = logarithms(rotations[1:] @ rotations[:-1].transpose(0, 2, 1))
         return turned, np.einsum('nij,nj->ni', rotations[:-1], np.diff(centres, axis=0))
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dashcalib_ros.arrays import Floats
+from dashcalib_ros.camera.rotation import centres_of, nearest_rotation
 from dashcalib_ros.rig.joint import UNKNOWN_UNIT, Gauge, Pair, Place, Problem, SceneKey
 from dashcalib_ros.rig.paths import CameraPaths, ScenePath
 
@@ -123,8 +124,7 @@ def _score(camera: CameraPaths, base: CameraPaths, late: float
     all_turns, its_turns = np.concatenate(turns), np.concatenate(theirs)
     both = all_turns.T @ its_turns + DIRECTION**2 * (
         np.concatenate(ways).T @ np.concatenate(their_ways))
-    u, _, v = np.linalg.svd(both)
-    rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ v))]) @ v
+    rotation = nearest_rotation(both)
     energy = float(np.sum(all_turns**2) + np.sum(its_turns**2)) / 2
     left = float(np.sum((all_turns - its_turns @ rotation.T)**2))
     explained = 1 - left / max(energy, 1e-12)
@@ -173,12 +173,11 @@ def _pair(cameras: Mapping[str, CameraPaths], places: Mapping[str, Place], refer
     if len(rows) < LEAST_SHARED:
         return None
     rotations, translations = its.trajectory.at(when[rows])
-    centres = -np.einsum('nji,nj->ni', rotations, translations)
+    centres = centres_of(rotations, translations)
     across = place.rotation @ places[reference[0]].rotation.T
     turned = np.sum((across @ rotations).transpose(0, 2, 1)
                     @ own.trajectory.rotations[rows], axis=0)
-    u, _, v = np.linalg.svd(turned)
-    gauge = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ v))]) @ v
+    gauge = nearest_rotation(turned)
     theirs = own.centres[rows] @ gauge.T
     scale = _length(centres) / max(_length(theirs), 1e-12)
     return Pair(reference, other, rows,
