@@ -26,6 +26,7 @@ from synthetic import synthetic_turn
 
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import Config
+from dashcalib_ros.demo import Drive, DriveSpec, Lens
 from dashcalib_ros.detect import Turn, TurnId
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.detect.one_camera import OtherCamera
@@ -488,6 +489,48 @@ def test_a_camera_in_use_is_compared_with_stored_turns(tmp_path):
         calibrator.scenes.forget_stored({TurnId.stored(1)})
         assert calibrator.status().reconstructed == (TurnId.stored(1),)
         assert len(calibrator.watch(lens, sigma).readings) == len(list(tmp_path.iterdir())) == 1
+
+
+def standing(on: str) -> Iterator[Frame]:
+    """Yield what a car that stands sees: the shore turns about a ferry, a lift passes a wall."""
+    wide = Lens.of(1280, 720, 115.0, 0.0, 0.0)
+    far = Drive(wide, DriveSpec(kind='parked', duration_s=1.0, noise=0.0, vibration_deg=0.0,
+                                seed=5)).frame(0).image
+    inner, outer = (np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]])
+                    for lens in (Lens.of(640, 360, 80.0, 0.0, 0.0), wide))
+    rng = np.random.default_rng(0)
+    for n in range(180):
+        if on == 'ferry':
+            x, y, z = np.radians([1.5 * np.sin(0.13 * n), 8 * np.sin(n / 30),
+                                  2 * np.sin(0.09 * n + 1)])
+            turned = np.eye(3)
+            for axis in ((x, 0, 0), (0, y, 0), (0, 0, z)):
+                turned = turned @ cv2.Rodrigues(np.array(axis))[0]
+            image = cv2.warpPerspective(far, inner @ turned @ np.linalg.inv(outer), (640, 360),
+                                        borderMode=cv2.BORDER_REFLECT)
+            image[260:] = far[500:600, 300:940]  # the deck
+        else:
+            image = np.roll(far, round(60 * np.sin(n / 20)), axis=0)[180:540, 300:940]
+        image = image + rng.normal(0, 1.5, image.shape)
+        yield Frame(n, n * 10**8, np.clip(image, 0, 255).astype(np.uint8))
+
+
+@pytest.mark.parametrize('on', ['ferry', 'lift'])
+def test_a_car_that_stands_while_pictures_move_is_refused(on):
+    with limited(Calibrator(QUICK.replace({'known.stabiliser': 'no'}))) as calibrator:
+        for frame in standing(on):
+            calibrator.push(frame)
+        found = calibrator.calibrate()
+    assert found.verdict.level == 'refused' and found.camera is None
+
+
+def test_a_drive_backwards_shows_the_same_lens(frames, result):
+    with limited(Calibrator(QUICK)) as calibrator:
+        for frame, back in zip(frames, frames[::-1], strict=True):
+            calibrator.push(replace(frame, image=back.image))
+        found = calibrator.calibrate()
+    assert found.verdict.level == result.verdict.level and len(found.turns) == len(result.turns)
+    assert abs(found.camera.fx - LENS.fx) < 3 * found.sigma['fx']
 
 
 @pytest.mark.parametrize(('own', 'more', 'used'), [

@@ -92,6 +92,9 @@ def test_gentle_bends_may_be_a_stabiliser_s_unless_it_is_known_that_there_is_non
     unknown = gentle()
     assert len(unknown.perhaps_shifted) == 3 and not unknown.crops
     assert 'E-ONLY-GENTLE' in judge(unknown, CONFIG.verdict).codes
+    apart = replace(unknown, misfits={**unknown.misfits, unknown.scenes[0].turn: 3.0})
+    assert judge(unknown, CONFIG.verdict).level == 'weak'
+    assert judge(apart, CONFIG.verdict).level == 'refused'
     known = gentle(CONFIG.replace({'known.stabiliser': 'no'}))
     assert not known.perhaps_shifted
     assert {'E-ONLY-GENTLE', 'E-LITTLE-YAW'}.isdisjoint(judge(known, CONFIG.verdict).codes)

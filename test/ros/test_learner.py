@@ -56,6 +56,7 @@ class Core:
         self.stored, self.pushed, self.done = (), [], []
         self.ready, self.frames, self.calls, self.pairs, self.asked = (), 0, 0, 0, []
         self.strangers, self.watched, self.checked = (), [], []
+        self.stretches, self.asks_stretches = (), False
         self.hold, self.closed = threading.Event(), threading.Event()
         self.hold.set()
         self.scenes = Scenes()
@@ -72,9 +73,9 @@ class Core:
         return self.status()
 
     def status(self):
-        ready = self.ready + self.stored
+        ready, further = self.ready + self.stored, self.stretches
         return Status(self.frames, len(ready), len(ready), 60.0 * len(ready), 0.1, False, ready,
-                      len(self.stored), (60.0,) * len(ready), self.ready)
+                      len(self.stored), (60.0,) * len(ready), self.ready, stretches=further)
 
     def sense(self, motion):
         self.motion = motion
@@ -92,7 +93,7 @@ class Core:
         turns = tuple(TurnSummary(turn.number, turn.number, turn.number, 0.0, 0.1, 1, 1,
                                   turn not in self.strangers,
                                   misfit=9.0 if turn in self.strangers else 1.0)
-                      for turn in ready)
+                      for turn in (*ready, *self.stretches))
         stored = tuple(StoredTurnSummary(turn, 0.0, 0.1, 60.0, 20, True, 1.0)
                        for turn in self.stored)
         return Calibration(Verdict('weak'), (64, 48), None, None, turns, 1, None, {}, {}, CONFIG,
@@ -123,7 +124,7 @@ class Scenes:
     """In the SceneSelection's place: of such a core."""
 
     def want(self, turns, more=0, stretches=True):
-        self.core.wanted = turns + more
+        self.core.wanted, self.core.asks_stretches = turns + more, stretches
 
     def exclude(self, reasons, keep_files=False):
         self.core.ready = tuple(turn for turn in self.core.ready if turn not in reasons)
@@ -200,6 +201,23 @@ def test_it_calibrates_when_enough_turns_are_built_and_again_only_with_others(de
     core.ready = at(20, 30)
     until(lambda: len(desk.results) == 2)
     assert core.calls == 2
+
+
+def test_one_new_turn_is_worth_a_calibration_and_so_are_as_many_new_stretches(desk):
+    core = Core.made[0]
+    core.stretches = at(1, 2)
+    until(lambda: len(desk.results) == 1 and core.asks_stretches)
+    core.stretches = at(1, 2, 3)
+    time.sleep(3 * room.LOOK_S)
+    assert core.calls == 1
+    core.stretches = at(1, 2, 3, 4)
+    until(lambda: len(desk.results) == 2)
+    core.ready = at(10)
+    until(lambda: len(desk.results) == 3)
+    assert 'other pieces' in desk.begun[0]
+    # a camera in use is compared with turns only
+    aim(desk, camera=CAMERA)
+    until(lambda: not core.asks_stretches)
 
 
 def test_a_turn_that_fits_another_camera_is_not_tried_over_and_over(desk):
