@@ -78,7 +78,6 @@ def _engine(args: argparse.Namespace, config: Config) -> Engine:
 
 
 def _summarise(cameras: Sequence[Camera], screen: Screen) -> int:
-    """Show what came of the cameras; return the exit code."""
     found = list(problems(cameras))
     warn(_problem(row, why) for row, why in found[:SHOWN])
     if len(found) > SHOWN:
@@ -92,7 +91,6 @@ def _summarise(cameras: Sequence[Camera], screen: Screen) -> int:
 
 
 def _as_dict(cameras: Sequence[Camera], files: Sequence[str]) -> dict[str, Any]:
-    """Return what --json prints: verdicts by camera, clips that could not be read, and files."""
     return {'cameras': {camera.name: camera.verdict for camera in cameras if camera.name},
             'not_read': [{'row': row.number, 'clip': row.clip, 'why': why}
                          for row, why in problems(cameras)],
@@ -106,8 +104,6 @@ def _problem(row: Row, why: str) -> str:
 
 @dataclass
 class _Progress:
-    """Shows the rate, the time left, and each camera as soon as it is solved."""
-
     clips: int
     screen: Screen
     stages: Stages
@@ -117,7 +113,6 @@ class _Progress:
     video_s: float = 0.0
 
     def tell(self, camera: Camera, clip: ClipResult | None) -> None:
-        """Count a clip that is done, or show a camera that is solved."""
         if clip is None:
             if camera.own is None or not camera.own.again:
                 self.screen.show(line(f'{camera.name}: {camera.verdict}'))
@@ -138,7 +133,6 @@ class _Progress:
         self.stages.show('clips', self.done / max(self.clips, 1), note)
 
     def effort_json(self, engine: Engine) -> bytes:
-        """Return the time and memory that the run took, to plan larger ones."""
         gather_s = engine.cpu_s['gather_clip']
         return (json.dumps({
             'wall_s': time.monotonic() - self.started, 'clips_read': self.read,

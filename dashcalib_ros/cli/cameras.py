@@ -45,7 +45,6 @@ def compare(args: argparse.Namespace) -> int:
 
 
 def _rig(args: argparse.Namespace) -> int:
-    """Show how the cameras A and B of one car are turned against each other."""
     if args.html is not None:
         raise UsageError('E-RIG-HTML', '--html maps the difference of two calibrations of one '
                                        'camera; omit it with --rig')

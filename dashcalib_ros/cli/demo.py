@@ -99,7 +99,6 @@ def demo(args: argparse.Namespace) -> int:
 
 
 def _rig(args: argparse.Namespace, config: Config, started: float) -> int:
-    """Render several cameras of one car, place them, compare with the truth."""
     drives = rig_drives(seed=config.seed)
     base, screen = next(iter(drives)), Screen(args.quiet, to_stderr=args.json)
     truth = {name: each.values for name, each in true_places(drives, base).items()}
@@ -150,7 +149,6 @@ def mapping_error(calibration: Calibration, drive: Drive, with_field: bool = Tru
 
 def _compared(calibration: Calibration, drive: Drive, lens: NamedCamera, found: Apart | None
               ) -> Iterator[RenderableType]:
-    """Yield the estimate beside the truth."""
     if calibration.camera is None:
         yield line('no estimate to compare with the truth')
         return
@@ -178,7 +176,6 @@ def _compared(calibration: Calibration, drive: Drive, lens: NamedCamera, found: 
 
 
 def _true_rays(drive: Drive) -> bytes:
-    """Return an .npz with the true viewing ray of each pixel, as `export --to rays` has them."""
     width, height = drive.lens.size
     pixels = np.stack(np.meshgrid(np.arange(float(width)), np.arange(float(height))), -1)
     rays = drive.lens.rays(pixels.reshape(-1, 2)).reshape(height, width, 3)

@@ -151,7 +151,6 @@ def turns(args: argparse.Namespace) -> int:
 
 
 def _enough(found: Outlook) -> tuple[str, str]:
-    """Return whether the turns are enough, with their degrees, and what to do next."""
     yaws, verdict = found.yaws_deg.values(), found.verdict
     text = f'{counted(len(found.turns), "turn")} found in {counted(found.frames, "frame")}'
     if yaws:

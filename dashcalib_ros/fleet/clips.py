@@ -168,7 +168,6 @@ def _noted(name: str, result: ClipResult) -> ClipResult:
 
 
 def _gathered(row: Row, out: str, config: Config, now: str) -> ClipResult:
-    """Write a clip's turns to their file. Raises DashcalibError, OSError."""
     if not now:
         return ClipResult(GONE)
     with local_copy(row.place) as path:
@@ -206,7 +205,6 @@ def gathered(out: str, name: str) -> SceneFile | None:
 
 
 def _given(path: Path) -> SceneFile:
-    """Return turns that were gathered elsewhere; raises InputError."""
     try:
         return decoded(read_file(path, LARGEST))
     except ValueError as error:

@@ -197,7 +197,6 @@ ONE_TURN_EXCESS = 3.0
 
 
 def _fitted(units: Sequence[Unit], config: FleetConfig) -> LensPrior:
-    """Return the most likely distribution of units that are all of one mode."""
     lenses = np.array([unit.lens for unit in units])
     own = np.array([unit.covariance for unit in units])
     vague = np.array([unit.one_turn for unit in units])
@@ -277,5 +276,4 @@ def _scales(camera: Camera) -> Floats:
 
 
 def _lens_places(count: int) -> list[int]:
-    """Return the places of what units of a model share: the focal length, the distortion."""
     return [0, *range(4, count)]

@@ -74,7 +74,6 @@ def _pinhole(p: list[float], path: Path) -> Sizeless:
 
 def _either(lines: Lines, number: str, raw: Callable[[], Camera],
             rectified: Callable[[], Camera], path: Path) -> Read:
-    """Return the camera of the raw or of the rectified pictures: their size tells which."""
     def of(size: tuple[int, int]) -> Camera:
         return (rectified if list(size) == lines[f'S_rect_{number}'] else raw)()
     return Sizeless(of, f'write rect_{number} for rectified pictures, raw_{number} for others')

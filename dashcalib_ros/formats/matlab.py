@@ -66,7 +66,6 @@ def _read(data: Data, path: Path) -> Camera | OtherLens:
 
 
 def _fisheye(data: Data, size: list[Any], path: Path) -> OtherLens:
-    """Return the lens of fisheyeIntrinsics, which is Scaramuzza's."""
     a0, *more = read_numbers(data[MAPPING], MAPPING, path, 4)
     cx, cy = read_numbers(data.get('DistortionCenter'), 'DistortionCenter', path, 2)
     stretch = read_numbers(data.get('StretchMatrix', [1, 0, 0, 1]), 'StretchMatrix', path, 4)

@@ -187,7 +187,6 @@ def calibration_of(data: Data, camera: Camera | None) -> CalibrationData:
 
 
 def _frozen(value: Any) -> Any:
-    """Return the value with tuples for its lists."""
     return tuple(map(_frozen, value)) if isinstance(value, list) else value
 
 
@@ -261,7 +260,6 @@ def cameras(data: Any, path: Path) -> Cameras:
 
 
 def _has_block(data: Any) -> bool:
-    """Return whether a file's data is a calibration.yaml with our block."""
     return opencv.has_matrix(data) and isinstance(data.get(ros.OWN), dict)
 
 
@@ -285,7 +283,6 @@ def _read(data: Data, path: Path) -> NamedCamera:
 
 
 def _intrinsics(data: Data, path: Path) -> Camera:
-    """Return result.json's camera. Raises InputError."""
     given = data.get('intrinsics')
     if not given:
         raise _no_intrinsics(str(path), data['verdict'], data.get('reasons'))
@@ -303,7 +300,6 @@ def _intrinsics(data: Data, path: Path) -> Camera:
 
 
 def _no_intrinsics(name: str, verdict: Any, reasons: Any) -> InputError:
-    """Return the error for a refused calibration."""
     known = '; '.join(map(str, reasons)) if isinstance(reasons, (list, tuple)) else ''
     return InputError('E-NO-INTRINSICS',
                       f'{name} has no intrinsics to compare, its verdict is {verdict}'
@@ -324,7 +320,6 @@ def calibrated_camera(calibration: CalibrationData, name: str = 'estimate') -> N
 
 
 def _of_camera(calibration: CalibrationData, count: int) -> Floats | None:
-    """Return the covariance of the camera's parameters, as the picture shows them."""
     found = calibration.picture_covariance
     return calibration.covariance if found is None else found[:count, :count]
 
@@ -362,7 +357,6 @@ def _counts(field: Mapping[str, Any]) -> bool:
 
 
 def _used_field(data: Any, image_size: tuple[int, int]) -> Field | None:
-    """Return result.json's field, None where there is none that is used."""
     if not isinstance(data, Mapping) or not _counts(data):
         return None
     try:
@@ -396,7 +390,6 @@ def _mount(data: Any) -> Mount | None:
 
 
 def _sigma_px(data: Any) -> PictureSigma | None:
-    """Return result.json's sigma over the picture; a missing one is no error."""
     try:
         return PictureSigma(*(read_number(data, key, '') for key in ('rms', 'worst')))
     except (AttributeError, TypeError, InputError):
@@ -404,7 +397,6 @@ def _sigma_px(data: Any) -> PictureSigma | None:
 
 
 def _readout_ms(data: Any) -> float | None:
-    """Return result.json's readout time; a missing one is no error."""
     try:
         return read_number(data, 'readout_ms', '')
     except (AttributeError, TypeError, InputError):

@@ -32,7 +32,6 @@ def write_maps(found: NamedCamera) -> bytes:
 
 
 def _npz(camera: Camera, **arrays: npt.NDArray[np.float32]) -> bytes:
-    """Return an .npz of arrays, and of the camera that they are of."""
     file = io.BytesIO()
     both: dict[str, Any] = {
         **arrays, 'K': camera.matrix, 'D': np.array(camera.ros_distortion()),

@@ -116,7 +116,6 @@ def doubts(camera: Camera, path: object) -> tuple[Notice, ...]:
 
 
 def _size_doubt(camera: Camera, path: object) -> tuple[Notice, ...]:
-    """Return that the centre is that of pictures of another size, where it is."""
     size = camera.image_size
     if _off(camera, size) <= AS_GIVEN:
         return ()
@@ -135,7 +134,6 @@ def _size_doubt(camera: Camera, path: object) -> tuple[Notice, ...]:
 
 
 def _size_of(camera: Camera) -> tuple[int, int] | None:
-    """Return the size of the pictures of which the centre is the middle."""
     width, height = camera.image_size
     multiples = [(round(width * n / m), round(height * n / m))
                  for n in range(1, MOST_PARTS + 1) for m in range(1, MOST_PARTS + 1) if n != m]
@@ -162,7 +160,6 @@ def _unseen(camera: Camera) -> tuple[float, float]:
 
 
 def _angles(camera: Camera) -> float:
-    """Return how far out the camera sees, as a share of what it would without distortion."""
     pixels = _pixels(camera)
     with np.errstate(all='ignore'):
         seen = np.arccos(np.clip(camera.rays(pixels)[:, 2], -1, 1))

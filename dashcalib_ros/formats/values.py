@@ -92,7 +92,6 @@ def pinhole(k: Sequence[float], path: object) -> Sizeless:
 
 
 def _check_count(d: Sequence[float], path: object) -> None:
-    """Raise InputError for a number of coefficients that no program writes for a pinhole."""
     if len(d) in COUNTS or not any(d[2:]):
         return
     if len(d) == 3:
@@ -338,7 +337,6 @@ def no_distortion(data: Data, what: str, cure: str, path: object) -> InputError:
 
 
 def _entries(data: Any) -> Iterator[tuple[Any, Any]]:
-    """Yield the keys and values of a file's data, and of what is in it."""
     if isinstance(data, Mapping):
         yield from data.items()
     for each in (data.values() if isinstance(data, Mapping) else

@@ -162,7 +162,6 @@ class _Metadata(NamedTuple):
 
 
 def _metadata(path: Path) -> _Metadata:
-    """Return the files and topics that metadata.yaml lists, or nothing if it cannot be used."""
     try:
         text = read_text(path, YAML_BYTES)
         content = parse_yaml(text, str(path))['rosbag2_bagfile_information']
@@ -183,7 +182,6 @@ def _metadata(path: Path) -> _Metadata:
 
 
 def _typed(topics: tuple[Topic, ...], others: tuple[Topic, ...]) -> tuple[Topic, ...]:
-    """Return topics with the types that others of their name have where theirs is missing."""
     types = {topic.name: topic.msgtype for topic in (*others, *topics) if topic.msgtype}
     counts = Counter[tuple[str, str]]()
     for topic in topics:
@@ -314,7 +312,6 @@ class BagSource(FrameSource):
 
 
 def _of_video(shot: _Shot, frame: Any) -> _Shot:
-    """Return a shot with the picture that its packet led to."""
     return shot._replace(decode=partial(FramePicture(), frame))
 
 
@@ -349,7 +346,6 @@ def _choose(path: Path, bag: Bag, name: str | None) -> Topic:
 
 
 def _check_readable(path: Path, bag: Bag) -> None:
-    """Raise InputError where a bag without image topics has images all the same."""
     filled = [topic for topic in bag.topics if topic.count]
     if untyped := [topic.name for topic in filled if not topic.msgtype]:
         raise InputError(

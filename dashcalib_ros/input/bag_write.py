@@ -216,7 +216,6 @@ def _messages(reader: Reader2, connections: list[Connection], source: str | os.P
 
 
 def _declared(writer: Writer, connection: Connection) -> Connection:
-    """Declare a topic as in the source, with the source's message definition if it has one."""
     ext: Any = connection.ext
     common: dict[str, Any] = {'serialization_format': ext.serialization_format,
                               'offered_qos_profiles': ext.offered_qos_profiles}
@@ -256,7 +255,6 @@ def _opened(source: str | os.PathLike[str], image_topic: str | None) -> Iterator
 
 
 def _checked_topic(source: str | os.PathLike[str], image_topic: str) -> str:
-    """Return the topic of a new camera_info; raises InputError where the bag has others there."""
     topic = camera_info_topic(image_topic)
     wrong = [each.msgtype for each in open_bag(Path(source)).topics
              if each.name == topic and each.msgtype not in CAMERA_INFOS]
@@ -276,7 +274,6 @@ def _check_limits(path: Path) -> None:
 
 
 def _camera_info(c: RosCamera, header: Any) -> bytes:
-    """Return a serialised CameraInfo."""
     store = types_of(Stores.ROS2_JAZZY)
     types: Any = store.types
     fields = {name: np.array(value) if isinstance(value, list) else value

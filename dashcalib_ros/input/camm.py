@@ -55,7 +55,6 @@ def streams(path: Path) -> Mapping[str, tuple[Floats, Floats]]:
 
 
 def _samples(file: BinaryIO, size: int) -> Iterator[tuple[float, bytes]]:
-    """Yield time, s, and bytes of each sample of the first track of CAMM."""
     for name, first, last in boxes(file, 0, size):
         for inner, at, end in boxes(file, first, last) if name == b'moov' else ():
             tables = _tables(file, at, end) if inner == b'trak' else {}
@@ -66,7 +65,6 @@ def _samples(file: BinaryIO, size: int) -> Iterator[tuple[float, bytes]]:
 
 def _tables(file: BinaryIO, at: int, end: int, way: tuple[bytes, ...] = WAY
             ) -> dict[bytes, bytes]:
-    """Return the tables of a track, each without its head."""
     found: dict[bytes, bytes] = {}
     for name, first, last in boxes(file, at, end):
         if name in way[:1]:
@@ -113,5 +111,4 @@ def _of_track(file: BinaryIO, length: int, tables: Mapping[bytes, bytes]
 
 
 def _whole(data: bytes, size: int) -> bytes:
-    """Return what is whole of a table of rows of so many bytes."""
     return data[:len(data) // size * size]

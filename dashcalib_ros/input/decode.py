@@ -211,7 +211,6 @@ def _is_packed(message: Any) -> bool:
 
 
 def _packed_image(message: Any) -> tuple[Any, bytes]:
-    """Return the image, whose data is still packed, and that; raises InputError for damage."""
     data = bytes(message.data)
     try:
         height, width, big, step, length = struct.unpack_from('<IIBII', data)
@@ -241,7 +240,6 @@ def _unpacked(message: Any) -> Any:
 
 
 def _name(message: Any) -> str:
-    """Return a name for messages about a CompressedImage; raises InputError for other formats."""
     name = ' '.join(str(message.format).split())
     if 'compresseddepth' in name.lower():
         raise InputError('E-IMAGE-DEPTH',

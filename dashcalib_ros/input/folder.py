@@ -96,7 +96,6 @@ class FolderSource(FrameSource):
                 None if self._begin_s is None else self._begin_s * SECOND_NS)
 
     def _turned(self) -> str:
-        """Return how the first picture is turned when it is shown; '' for not at all."""
         from dashcalib_ros.input.decode import turned_text
         with suppress(InputError):  # raised again when it is read
             return turned_text(read_file(self._path / self._names[0], PICTURE_BYTES), '')
@@ -350,7 +349,6 @@ class _Table:
                             []) if first else []
 
     def column(self, column: int) -> list[str]:
-        """Return a column's cells, '' where a line lacks it."""
         return [row[column] if len(row) > column else '' for row in self.rows]
 
     def naming(self, names: Sequence[str], stems: Sequence[str], folder: str
@@ -405,7 +403,6 @@ class _Table:
 
 
 def _is_drive(stamps_ns: Sequence[int | None]) -> bool:
-    """Return whether these may be the times of a drive's images, and not whole seconds."""
     known = sorted(ns for ns in stamps_ns if ns is not None)
     steps = [b - a for a, b in pairwise(known)]
     return (bool(steps) and len(known) >= (1 - LACKING) * len(stamps_ns)

@@ -123,7 +123,6 @@ def _first_line(path: Path, what: str) -> str:
 
 
 def _mark(line: str) -> str:
-    """Return what is between the columns of a line."""
     return next((each for each in ';\t,' if each in line), ',')
 
 
@@ -132,7 +131,6 @@ def _names(line: str) -> list[str]:
 
 
 def _log_of(path: Path) -> Mapping[str, str] | None:
-    """Return the headings by our names of a CSV that a known logger has written."""
     try:
         names = set(_names(_first_line(path, str(path))))
     except InputError:
@@ -142,7 +140,6 @@ def _log_of(path: Path) -> Mapping[str, str] | None:
 
 
 def _csvs(files: Sequence[Path], path: Path, columns: Mapping[str, str] | None) -> SensorStream:
-    """Read files of one logger as one stream. path: for messages."""
     values: dict[str, tuple[Floats, Floats]] = {}
     warnings: list[Notice] = []
     for file in files:
@@ -158,7 +155,6 @@ def _csvs(files: Sequence[Path], path: Path, columns: Mapping[str, str] | None) 
 
 def _csv(lines: Iterator[str], path: Path, columns: Mapping[str, str] | None
          ) -> tuple[dict[str, tuple[Floats, Floats]], tuple[Notice, ...]]:
-    """Return the values of a CSV by kind, and what is to be said."""
     head, scales = next(lines, ''), dict[str, float]()
     if head.strip() == GCSV:
         # its orientation is Gyroflow's: the chip's own axes are those of a rotation
@@ -215,7 +211,6 @@ def _csv(lines: Iterator[str], path: Path, columns: Mapping[str, str] | None
 
 
 def _factor(ours: str, theirs: str, scales: Mapping[str, float]) -> float:
-    """Return what a column is to be multiplied by, as its heading or the file's head says."""
     if ours.startswith('gyro'):
         return (scales.get('gscale', 1.0) if scales else
                 np.pi / 180 if DEGREES.search(theirs.lower()) else 1.0)
@@ -280,12 +275,10 @@ class _TrackPoints:
         self._text = '' if self._point is not None and _plain(tag) in ('ele', 'time') else None
 
     def data(self, text: str) -> None:
-        """Take a text, or a part of it."""
         if self._text is not None and len(self._text) < DIGITS:
             self._text += text
 
     def end(self, tag: str) -> None:
-        """Take the end of an element."""
         self._depth -= 1
         if self._point is not None and self._text is not None:
             self._point[_plain(tag)] = self._text
@@ -320,7 +313,6 @@ def _gpx(text: str, path: Path) -> SensorStream:
 
 
 def _inside_video(path: Path) -> SensorStream:
-    """Read the gyro or GPS that a camera has written into its video."""
     try:
         check_file(path, f'the video {path}')
         if inside := novatek.fixes(path):

@@ -239,7 +239,6 @@ def _decoded(packet: av.Packet[av.VideoStream]) -> Sequence[av.VideoFrame | None
 
 
 def _time_ns(of: av.VideoFrame | av.Packet[av.VideoStream]) -> int | None:
-    """Return when a picture is shown on the file's clock."""
     time = of.pts if of.pts is not None else of.dts
     return round(time * of.time_base * SECOND_NS) if time is not None and of.time_base else None
 
@@ -280,7 +279,6 @@ def _chosen(path: Path, topic: str | None) -> tuple[int | None, list[Notice]]:
 
 
 def _streams(container: InputContainer) -> list[av.VideoStream]:
-    """Return the streams of a video that are no thumbnails."""
     return [each for each in container.streams.video if not each.disposition & THUMBNAILS]
 
 

@@ -134,7 +134,6 @@ class Checking:
         return True, 'collecting; the calibration of the driver is not changed'
 
     def _warnings(self) -> list[str]:
-        """Return what keeps the calibration from being checked."""
         if self._given is None:
             return [self._problem]
         if self._fits or self._size is None:
@@ -177,7 +176,6 @@ class Checking:
             self._take(message, what == 'changed')
 
     def _take(self, message: CameraInfo, changed: bool) -> None:
-        """Check this calibration from now on."""
         topic = self._given_topic
         if changed:
             self._log.warning(f'the calibration on {topic} has changed: it is checked again')

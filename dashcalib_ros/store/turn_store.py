@@ -155,7 +155,6 @@ class TurnStore:
             self._remove_excess()
 
     def _names(self) -> list[str]:
-        """Return the names of all files that may be turns."""
         remove_leftovers(self._folder, NAMES)
         try:
             return sorted(path.name for path in self._folder.iterdir() if path.suffix == SUFFIX)
@@ -178,7 +177,6 @@ class TurnStore:
                 f'folder for each camera in turns.store'))
 
     def _read(self, name: str) -> tuple[Origin, StoredTurn]:
-        """Return a file's origin and turn; raises InputError if it is no stored turn."""
         data = read_file(self._folder / name, LARGEST, name)
         try:
             file = decoded(data)
@@ -189,7 +187,6 @@ class TurnStore:
         return file.origin, turn
 
     def _header(self, name: str) -> tuple[Origin, float] | None:
-        """Return a file's origin and prominence, None if it is no stored turn."""
         if name not in self._headers:
             try:
                 origin, turn = self._read(name)
