@@ -86,9 +86,9 @@ def camera_with(size: Sequence[Any], view: Sequence[float], kind: str, d: Sequen
     return camera
 
 
-def pinhole(k: Sequence[float], path: object) -> Sizeless:
-    """Return the camera of K (9,), of pictures without distortion whose size is not written."""
-    return Sizeless(lambda size: camera_with(size, focal_and_centre(k), PLUMB_BOB, (), path))
+def pinhole(view: Sequence[float], path: object) -> Sizeless:
+    """Return the camera of fx, fy, cx, cy, of pictures without distortion and without a size."""
+    return Sizeless(lambda size: camera_with(size, view, PLUMB_BOB, (), path))
 
 
 def _check_count(d: Sequence[float], path: object) -> None:
