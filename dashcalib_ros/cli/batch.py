@@ -13,7 +13,7 @@ from typing import Any
 
 from dashcalib_ros.cli.arguments import ACCEPTED, NOT_ENOUGH
 from dashcalib_ros.cli.drive import read_config
-from dashcalib_ros.cli.terminal import Screen, Stages, warn
+from dashcalib_ros.cli.terminal import Screen, Stages, print_json, warn
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import Notice, counted
 from dashcalib_ros.fleet.batch import Camera, cameras_of, problems, shard_of
@@ -21,15 +21,14 @@ from dashcalib_ros.fleet.batch import batch as calibrate_fleet
 from dashcalib_ros.fleet.clips import ClipResult
 from dashcalib_ros.fleet.engine import Engine, LocalEngine, RayEngine
 from dashcalib_ros.fleet.manifest import Row, read_manifest
-from dashcalib_ros.fleet.overview import duration
+from dashcalib_ros.fleet.overview import LEVELS, duration
 from dashcalib_ros.fleet.storage import joined, masked, remove, write
 from dashcalib_ros.report.tables import line
-from dashcalib_ros.standard_streams import write_stderr, write_stdout
+from dashcalib_ros.standard_streams import write_stderr
 from dashcalib_ros.workers.child import ChildWorker
 
 # problems that are shown; the table has all
 SHOWN = 10
-LEVELS = ('accepted', 'weak', 'refused')
 
 
 def batch(args: argparse.Namespace) -> int:
@@ -62,7 +61,7 @@ def batch(args: argparse.Namespace) -> int:
     if files:
         progress.screen.show(line(f'written to {out}: ' + ', '.join(files)))
     if args.json:
-        write_stdout(json.dumps(_as_dict(cameras, files), indent=2, allow_nan=False))
+        print_json(_as_dict(cameras, files))
     return _summarise(cameras, progress.screen)
 
 

@@ -22,7 +22,7 @@ from dashcalib_ros.cli.arguments import ACCEPTED, NOT_ENOUGH, exit_code
 from dashcalib_ros.cli.drive import read_config
 from dashcalib_ros.cli.rig import rig_lines, write_rig
 from dashcalib_ros.cli.run import files_line, now, warn_of
-from dashcalib_ros.cli.terminal import Screen, Stages
+from dashcalib_ros.cli.terminal import Screen, Stages, print_json
 from dashcalib_ros.config import Config
 from dashcalib_ros.demo import (
     DEMOS,
@@ -85,9 +85,8 @@ def demo(args: argparse.Namespace) -> int:
     warn_of(calibration, written)
     found = None if calibration.camera is None else mapping_error(calibration, drive)
     if args.json:
-        write_stdout(json.dumps(plain_values({
-            **result_dict(calibration), 'truth': truth,
-            'mapping_px': None if found is None else found.rms}), indent=2, allow_nan=False))
+        print_json(plain_values({**result_dict(calibration), 'truth': truth,
+                                 'mapping_px': None if found is None else found.rms}))
     names = [TRUTH, *[TRUE_RAYS] * bent, *['bag'] * args.keep_bag]
     screen.show(
         conclusion(calibration.verdict), summary(calibration),
