@@ -273,10 +273,7 @@ class Learner:
         self._now.calibrator.close()
 
     def _serve(self, wait_s: float = 0.0) -> bool:
-        """Do what is next in the inbox; return whether there was something.
-
-        The calibrator calls this while it waits for a child.
-        """
+        """Do what is next in the inbox, also while the calibrator waits for a child."""
         action = self.inbox.get(wait_s)
         if action is None or self._closed:
             return False

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
 
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Header
@@ -12,7 +11,6 @@ from dashcalib_ros.camera import Camera, ros_camera
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import InputError, OutputError, coded
 from dashcalib_ros.formats import calibrated_camera
-from dashcalib_ros.input.decode import read_mask
 from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.report import Calibration, NamedCamera
 from dashcalib_ros.report.wording import mount_text, mounts_text
@@ -58,8 +56,7 @@ class Calibrating:
         self._confirmed = True
         # turns of this drive, with their bank, that were in a contradiction that was counted
         self._counted: frozenset[tuple[int, TurnId]] = frozenset()
-        mask = read_mask(Path(own.mask_file)) if own.mask_file else None
-        self.drive = Drive(endpoints, settings, camera_name, mask, self)
+        self.drive = Drive(endpoints, settings, camera_name, self)
         endpoints.service('~/calibrate', self.drive.calibrate)
         endpoints.service('~/calibrate_now', self.drive.calibrate_now)
         endpoints.service('~/reset', self.reset)
@@ -82,10 +79,7 @@ class Calibrating:
         return None if self._kept is None or self._stale else self._kept.camera
 
     def _watch(self) -> None:
-        """Let the drive work for the camera in use, or for a first one.
-
-        The first one needs all turns wanted; to check a published one, a few are enough.
-        """
+        """Let the drive work: for a first camera by all turns wanted, to check one by a few."""
         core, trusted = self._core, self._trusted()
         wanted = core.turns.wanted
         self.drive.watch(Goal(
@@ -116,10 +110,7 @@ class Calibrating:
                        f'turns agree with it')
 
     def _check_writable(self) -> None:
-        """Raise OutputError where no calibration can be kept; one that is there is used, though.
-
-        It may be installed where the node may not write.
-        """
+        """Raise OutputError where no calibration can be kept; an installed one is used, though."""
         try:
             self._store.check_writable()
         except OutputError as error:

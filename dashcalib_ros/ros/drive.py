@@ -11,14 +11,14 @@ import queue
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
+from pathlib import Path
 from typing import Any, Protocol
 
 from rclpy.task import Future
 from std_msgs.msg import Float64, Header
 
-from dashcalib_ros.arrays import Mask
 from dashcalib_ros.errors import DashcalibError, InputError
-from dashcalib_ros.input.decode import check_mask
+from dashcalib_ros.input.decode import check_mask, read_mask
 from dashcalib_ros.judge import Monitor, Verdict
 from dashcalib_ros.report.wording import witness_texts
 from dashcalib_ros.ros.background import (
@@ -86,16 +86,16 @@ class Drive:
     in use, None before they do. verdict: of the last calibration.
     """
 
-    def __init__(self, endpoints: Endpoints, settings: Settings, camera_name: str,
-                 mask: Mask | None, role: Role) -> None:
-        """camera_name: in /diagnostics. mask: (h, w), False where pixels are not used.
+    def __init__(self, endpoints: Endpoints, settings: Settings, camera_name: str, role: Role
+                 ) -> None:
+        """camera_name: in /diagnostics.
 
-        Raises ConfigError for a topic's name that is none.
+        Raises ConfigError for a topic's name that is none, InputError for the mask's file.
         """
-        self._endpoints, self._settings, self._role = endpoints, settings, role
-        self._camera_name, self._mask = camera_name, mask
+        self._endpoints, self._camera_name, self._role = endpoints, camera_name, role
         self._log, self._complaints = endpoints.log, endpoints.complaints
         core, own = settings.core, settings.own
+        self._mask = read_mask(Path(own.mask_file)) if own.mask_file else None
         self.held = ''
         self.monitor: Monitor | None = None
         self.verdict: Verdict | None = None
@@ -125,7 +125,8 @@ class Drive:
         self.images = ImageInput(
             endpoints, own, self._video.put if self._video else self._on_image)
         self._goal = Goal(core)
-        self.learner = Learner(self._goal, own.queue_size, self._hear, self._preview.take, mask)
+        self.learner = Learner(self._goal, own.queue_size, self._hear, self._preview.take,
+                               self._mask)
         endpoints.at_end(self.learner.close)
         subscribe_sensors(endpoints, own, self.learner.sensors.add)
         endpoints.timer(PERIOD_S, self._tick)

@@ -301,8 +301,8 @@ class ImageInput:
         if self._missing != kind:
             self._missing = kind
             package = kind.partition('/')[0].replace('_', '-')
-            self._log.error(f'{topic} has {kind}, whose package is not installed: '
-                                          f'apt install ros-$ROS_DISTRO-{package}')
+            self._log.error(f'{topic} has {kind}, whose package is not installed: apt install '
+                            f'ros-$ROS_DISTRO-{package}')
 
     def look(self) -> None:
         """Find out who publishes, and follow that: images before the right one are lost."""
@@ -314,8 +314,7 @@ class ImageInput:
             return
         fitting = 'reliable' if all(map(_reliable, infos)) else 'best_effort'
         if fitting != self.reliability:
-            self._log.info(f'{self.topic}: subscribing {fitting}, like its '
-                                         f'publishers')
+            self._log.info(f'{self.topic}: subscribing {fitting}, like its publishers')
             self.stop()
             self.reliability = fitting
             self.start()
@@ -345,8 +344,7 @@ class ImageInput:
             self._logged = None
         elif self._logged is None or now - self._logged >= AGAIN_S:
             self._logged = now
-            self._log.info(f'no images on {self.topic} {since_text(silent_s)}; '
-                                         f'{self._reason()}')
+            self._log.info(f'no images on {self.topic} {since_text(silent_s)}; {self._reason()}')
 
     def _reason(self) -> str:
         infos = self._node.get_publishers_info_by_topic(self.topic)
