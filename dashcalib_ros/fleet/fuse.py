@@ -125,10 +125,7 @@ def _same_content(clips: Clips) -> dict[str, Notice]:
 
 
 def _other_origins(clips: Clips) -> dict[str, Notice]:
-    """Return the clips with another image size than most: a calibration holds for one.
-
-    Pictures that were resized differently, with other settings, are of another size, too.
-    """
+    """Return the clips of another image size than most, or that were resized differently."""
     def weight(origin: Origin) -> tuple[int, int, int, str]:
         turns = [len(clip.turns) for clip in clips.values() if clip.origin == origin]
         # clips count before turns: one clip with many does not decide

@@ -95,10 +95,7 @@ def _read_echoed(data: Data, path: Path) -> NamedCamera | OtherLens:
 
 def _check_whole(size: tuple[int, int], binning: Sequence[float], roi: Sequence[float],
                  name: str | Path) -> None:
-    """Raise InputError for a CameraInfo of a part of the sensor, or of one that is binned.
-
-    roi: x, y, width, height.
-    """
+    """Raise InputError for a part of the sensor, or binning. roi: x, y, width, height."""
     if tuple(roi) not in ((0, 0, 0, 0), (0, 0, *size)) or max(binning) > 1:
         raise InputError('E-CALIBRATION-PART',
                          f'{name} has binning or a region of interest: use the calibration of the '

@@ -178,10 +178,7 @@ def new_bag(path: Path) -> Iterator[Writer]:
 
 @contextmanager
 def _new_folder(path: Path, made: bool = True) -> Iterator[Path]:
-    """Give a folder with the last name of a path, which appears there when all went well.
-
-    made: it is there already. Raises OutputError when it exists or cannot be written.
-    """
+    """Give a folder that appears at a path when all went well. made: it is there already."""
     path = path.absolute()
     _check_free(path)
     try:

@@ -370,10 +370,7 @@ def _open_one(place: Path, topic: str | None, fps: float | None) -> FrameSource:
 
 
 def _opener_of(path: Path) -> Callable[[Path, str | None, float | None], FrameSource] | None:
-    """Return what opens a kind of input (path, topic and rate, as open_frames() has them).
-
-    A folder with a bag in it is no folder of images.
-    """
+    """Return what opens a kind of input; a folder with a bag in it is no folder of images."""
     if fits_bag(path):
         from dashcalib_ros.input.bag_storage import BagSource
         return BagSource
@@ -546,10 +543,7 @@ class _Place:
         self._recorded = part.recorded
 
     def _joint(self, part: FrameSource, stamp_ns: int) -> tuple[int, bool, bool]:
-        """Return how a source follows the one before. stamp_ns: its first one.
-
-        That is: what is added to its stamps, whether there is a gap, whether there may be one.
-        """
+        """Return what is added to its stamps, whether there is a gap, whether there may be one."""
         if not part.recorded:
             return self._next_ns, False, self.index > 0
         if self.index == 0:
@@ -563,10 +557,7 @@ class _Place:
 
 
 def _together(told: Sequence[tuple[str, Sequence[Notice]]]) -> tuple[Notice, ...]:
-    """Return the warnings of all sources; what several say in the same words is said once.
-
-    told: names and warnings.
-    """
+    """Return the warnings of all sources; what several say in the same words is said once."""
     first: dict[str, Notice] = {}
     counts: Counter[str] = Counter()
     for name, warnings in told:

@@ -471,10 +471,7 @@ def bag_motion(paths: Iterable[Path], chosen: Mapping[str, str | None],
 
 
 def _aligned(bag: Bag, topics: Sequence[str], images: str | None) -> dict[str, float]:
-    """Return what is to be added to stamps, s, of those topics that are not of the images' clock.
-
-    images: their topic; None: the only one. Where it is not known nothing is added.
-    """
+    """Return what to add to stamps, s, of topics of another clock than the images'."""
     shown = [topic.name for topic in bag.topics if topic.is_image and topic.count
              and (images is None or topic.name.strip('/') == images.strip('/'))]
     ours = _late_s(bag, shown[0]) if len(shown) == 1 and topics else None
