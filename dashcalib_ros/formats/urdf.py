@@ -35,7 +35,10 @@ def write(found: NamedCamera) -> str:
         f'{found.name}: how the camera sits on the car, {mount.verdict}', *mount.reasons,
         *(f'{what}: {_with_sigma(mount, key)}' for key, what in WRITTEN.items()),
         f'x and y are not known: {BASE} is on the road below the camera until you set them']
-    lines = '\n'.join(f'  {_in_comment(each)}' for each in about)
+    # no comment of XML may have two hyphens
+    lines = '\n'.join(f'  {re.sub("-(?=-)", "- ", visible(each))}' for each in about)
+    # about the fixed axes, as URDF has them
+    rpy = _radians(mount.roll_right_deg or 0.0, -mount.pitch_up_deg, mount.yaw_left_deg)
     return f'''<?xml version="1.0"?>
 <!--
 {lines}
@@ -46,7 +49,7 @@ def write(found: NamedCamera) -> str:
   <joint name="{name}_joint" type="fixed">
     <parent link="{BASE}"/>
     <child link="{name}_link"/>
-    <origin xyz="0 0 {_number(mount.height_m or 0.0)}" rpy="{_radians(*_rpy(mount))}"/>
+    <origin xyz="0 0 {_number(mount.height_m or 0.0)}" rpy="{rpy}"/>
   </joint>
   <link name="{name}_optical_frame"/>
   <joint name="{name}_optical_joint" type="fixed">
@@ -113,11 +116,6 @@ def _frame_name(source: str) -> str:
     return f'{name}_camera' if f'{name}_link' == BASE else name
 
 
-def _rpy(mount: Mount) -> tuple[float, float, float]:
-    """Return roll, pitch and yaw about the fixed axes, as URDF has them, degrees."""
-    return mount.roll_right_deg or 0.0, -mount.pitch_up_deg, mount.yaw_left_deg
-
-
 def _radians(*degrees: float) -> str:
     return ' '.join(_number(math.radians(each)) for each in degrees)
 
@@ -131,8 +129,3 @@ def _with_sigma(mount: Mount, name: str) -> str:
     if value is None or sigma is None:
         return 'not known, 0 is written'
     return f'{value:.3f}, standard deviation {sigma:.3f}'
-
-
-def _in_comment(text: str) -> str:
-    """Return a text without what no comment of XML may have."""
-    return re.sub('-(?=-)', '- ', visible(text))

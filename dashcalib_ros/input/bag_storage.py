@@ -16,7 +16,6 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import starmap
 from pathlib import Path, PurePath
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from dashcalib_ros.arrays import Pixels
@@ -153,15 +152,8 @@ def open_bag(path: Path) -> Bag:
     return Bag(files, topics, indexed, tuple(warnings), metadata.begins_ns)
 
 
-class _Metadata(NamedTuple):
-    """What metadata.yaml lists; begins_ns: of packed files."""
-
-    files: tuple[Path, ...] = ()
-    topics: tuple[Topic, ...] = ()
-    begins_ns: Mapping[Path, int] = MappingProxyType({})
-
-
-def _metadata(path: Path) -> _Metadata:
+def _metadata(path: Path) -> Bag:
+    """Return the bag that metadata.yaml lists, an empty one where it cannot be used."""
     try:
         text = read_text(path, YAML_BYTES)
         content = parse_yaml(text, str(path))['rosbag2_bagfile_information']
@@ -177,8 +169,8 @@ def _metadata(path: Path) -> _Metadata:
                   int(each['starting_time']['nanoseconds_since_epoch'])
                   for each in content.get('files') or () if each['path'].endswith('.zstd')}
     except (InputError, KeyError, TypeError, ValueError, OverflowError, AttributeError):
-        return _Metadata()
-    return _Metadata(files, _sorted(counts), begins)
+        return Bag((), (), True, ())
+    return Bag(files, _sorted(counts), True, (), begins)
 
 
 def _typed(topics: tuple[Topic, ...], others: tuple[Topic, ...]) -> tuple[Topic, ...]:

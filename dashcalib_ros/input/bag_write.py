@@ -39,11 +39,15 @@ TRANSPORTS = ('compressed', 'ffmpeg', 'foxglove', 'zstd')
 REPAIR = "repair the bag first ('ros2 bag convert', 'mcap recover', 'ros2 bag reindex')"
 
 
+def base_topic(topic: str) -> str:
+    """Return an image topic without the transport that image_transport adds to its name."""
+    base, _, transport = topic.rpartition('/')
+    return base if transport in TRANSPORTS else topic
+
+
 def camera_info_topic(image_topic: str) -> str:
     """Return the camera_info topic that image_transport expects for an image topic."""
-    base, _, transport = image_topic.rpartition('/')
-    base = base if transport in TRANSPORTS else image_topic
-    return f'{base.rpartition("/")[0]}/camera_info'
+    return f'{base_topic(image_topic).rpartition("/")[0]}/camera_info'
 
 
 def first_camera_info(path: Path, topic: str | None = None) -> tuple[str, Any]:

@@ -17,7 +17,6 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.errors import InputError, Notice, one_line, shortened
-from dashcalib_ros.input import camm, novatek
 from dashcalib_ros.input.inputs import is_video
 from dashcalib_ros.input.motion import (
     DOUBT_S,
@@ -29,6 +28,7 @@ from dashcalib_ros.input.motion import (
     sensor_stream,
     values_in,
 )
+from dashcalib_ros.input.mp4_sensors import camm_streams, novatek_fixes
 from dashcalib_ros.input.source import by_name, os_error
 from dashcalib_ros.input.times import UNITS as TIME_UNITS
 from dashcalib_ros.input.times import dated_ns, numbers_in, paired, unit_of
@@ -286,7 +286,8 @@ class _TrackPoints:
         if _plain(tag) == 'trkpt' and self._point is not None:
             point, self._point = self._point, None
             if 'time' in point:
-                self.rows.append(_epoch_s(point['time']))
+                ns = dated_ns(point['time'])
+                self.rows.append(np.nan if ns is None else ns / 10**9)
                 self.rows.extend(_number(point.get(key, '')) for key in ('lat', 'lon', 'ele'))
 
 
@@ -315,13 +316,13 @@ def _gpx(text: str, path: Path) -> SensorStream:
 def _inside_video(path: Path) -> SensorStream:
     try:
         check_file(path, f'the video {path}')
-        if inside := novatek.fixes(path):
+        if inside := novatek_fixes(path):
             rows = np.array(inside)
             return replace(sensor_stream({'position': (rows[:, 0], rows[:, 1:4]),
                                           'speed': (rows[:, 0], rows[:, 4:])}, str(path)),
                            doubt_s=DOUBT_S)
-        if found_inside := camm.streams(path):
-            return sensor_stream(found_inside, str(path))
+        if streams := camm_streams(path):
+            return sensor_stream(streams, str(path))
     except OSError as error:
         raise os_error(path, error) from error
     try:
@@ -359,12 +360,6 @@ def _gopro_fixes(block: Mapping[str, Any] | None) -> Iterator[tuple[float, ...]]
     for number, row in enumerate(rows):
         stamp_s = block['TimestampUs'] / 1e6 + number * GOPRO_BLOCK_S / len(rows)
         yield (stamp_s, *(np.array(row[:4], np.float64) / scale).tolist())
-
-
-def _epoch_s(text: str) -> float:
-    """Return s since 1970 of a date and time, in UTC where it names no zone; NaN for none."""
-    ns = dated_ns(text)
-    return np.nan if ns is None else ns / 10**9
 
 
 def _oxts(folder: Path) -> SensorStream:

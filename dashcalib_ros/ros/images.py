@@ -19,7 +19,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from rclpy.utilities import get_rmw_implementation_identifier
 
 from dashcalib_ros.errors import InputError, coded, counted
-from dashcalib_ros.input.bag_write import TRANSPORTS
+from dashcalib_ros.input.bag_write import base_topic
 from dashcalib_ros.input.decode import message_size
 from dashcalib_ros.input.stamps import StampGate
 from dashcalib_ros.ros.background import decode_checked
@@ -380,7 +380,7 @@ class ImageInput:
 
     def _drawn(self, topic: str) -> bool:
         """Return whether another node like this one draws what is on a topic, for people."""
-        place, _, _ = _base(topic).rpartition('/')
+        place, _, _ = base_topic(topic).rpartition('/')
         return bool(self._node.count_publishers(f'{place}/turn_magnitude'))
 
 
@@ -390,12 +390,7 @@ def _has_a_name(topic: str, kind: str) -> bool:
 
 
 def _arguments(topic: str, kind: str) -> str:
-    return f'-r image_raw:={_base(topic)} -p image_transport:={KINDS[kind]}'
-
-
-def _base(topic: str) -> str:
-    base, _, last = topic.rpartition('/')
-    return base if last in TRANSPORTS else topic
+    return f'-r image_raw:={base_topic(topic)} -p image_transport:={KINDS[kind]}'
 
 
 def since_text(silent_s: float | None) -> str:
