@@ -25,31 +25,14 @@ from dashcalib_ros.errors import (
     coded,
     one_line,
 )
+from dashcalib_ros.fleet import storage
 from dashcalib_ros.fleet.manifest import Row
-from dashcalib_ros.fleet.storage import (
-    clip_files,
-    is_url,
-    joined,
-    local_copy,
-    masked,
-    read,
-    stamp,
-    write,
-)
 from dashcalib_ros.input.inputs import open_frames
 from dashcalib_ros.limits import read_file
 from dashcalib_ros.reconstruct import reconstruct
 from dashcalib_ros.solve.evidence import SHARP_DEG
-from dashcalib_ros.store.scene_file import (
-    FORMAT,
-    LARGEST,
-    SUFFIX,
-    Origin,
-    SceneFile,
-    StoredTurn,
-    decoded,
-    encoded,
-)
+from dashcalib_ros.store import scene_file
+from dashcalib_ros.store.scene_file import Origin, SceneFile, StoredTurn
 from dashcalib_ros.whole_files import FULL
 from dashcalib_ros.workers.memory import in_a_file
 
@@ -96,7 +79,8 @@ def looked_at(row: Row, out: str, config: Config) -> ClipResult | None:
     """
     if row.problem:
         return ClipResult(coded(Notice('E-MANIFEST-ROW', row.problem)), again=True)
-    if is_url(row.place) or os.path.lexists(row.place) or read(clip_file(row, out, config)):
+    if (storage.is_url(row.place) or os.path.lexists(row.place)
+            or storage.read(clip_file(row, out, config))):
         return None
     return ClipResult(GONE)
 
@@ -109,7 +93,7 @@ def gather_clip(row: Row, out: str, config: Config) -> ClipResult:
     name, now = clip_file(row, out, config), ''
     try:
         # before it is read: what changes later is read again
-        now = stamp(row.place) or ''
+        now = storage.stamp(row.place) or ''
         return _earlier(name, out, now) or _noted(name, _gathered(row, out, config, now))
     except InputError as error:
         return _noted(name, ClipResult(coded(error, LONGEST), now))
@@ -132,13 +116,14 @@ def set_aside(row: Row, out: str, config: Config) -> ClipResult:
     error = WorkerError('E-CLIP-SET-ASIDE',
                         f'its worker process died {config.fleet.attempts} times, and it is set '
                         f'aside; check that the clip is sound and that there is enough memory')
-    return _noted(clip_file(row, out, config), ClipResult(coded(error), stamp(row.place) or ''))
+    return _noted(clip_file(row, out, config),
+                  ClipResult(coded(error), storage.stamp(row.place) or ''))
 
 
 def clip_file(row: Row, out: str, config: Config) -> str:
     """Return the place of the file about what became of a clip."""
-    key = hash_of([masked(row.place), settings_hash(config, row.fps, row.topic)])
-    return joined(out, f'clips/{key[:2]}/{key}.json')
+    key = hash_of([storage.masked(row.place), settings_hash(config, row.fps, row.topic)])
+    return storage.joined(out, f'clips/{key[:2]}/{key}.json')
 
 
 def hash_of(values: object) -> str:
@@ -152,32 +137,31 @@ def _earlier(name: str, out: str, now: str) -> ClipResult | None:
     A clip that changed since is read again. One that is gone is not needed any more.
     """
     try:
-        values = json.loads(read(name) or b'')
+        values = json.loads(storage.read(name) or b'')
         result = ClipResult(**{**values, 'warnings': tuple(values['warnings']), 'again': True})
     except (ValueError, KeyError, TypeError):
         return None
     holds = now == result.stamp or (result.file and not now)
-    there = not result.file or stamp(joined(out, result.file))
+    there = not result.file or storage.stamp(storage.joined(out, result.file))
     return result if holds and there else None
 
 
 def _noted(name: str, result: ClipResult) -> ClipResult:
     if result.stamp:
-        write(name, json.dumps(asdict(result), sort_keys=True).encode())
+        storage.write(name, json.dumps(asdict(result), sort_keys=True).encode())
     return result
 
 
 def _gathered(row: Row, out: str, config: Config, now: str) -> ClipResult:
-    """Write a clip's turns to their file. Raises DashcalibError, OSError."""
     if not now:
         return ClipResult(GONE)
-    with local_copy(row.place) as path:
+    with storage.local_copy(row.place) as path:
         try:
             content = content_hash(path)
             # turns that were gathered elsewhere have whatever settings
-            given = path.suffix == SUFFIX
+            given = path.suffix == scene_file.SUFFIX
             of = content if given else f'{content}-{settings_hash(config, row.fps, row.topic)}'
-            name = f'gathered/{of[:2]}/{of}{SUFFIX}'
+            name = f'gathered/{of[:2]}/{of}{scene_file.SUFFIX}'
             found = gathered(out, name)
             if found is None:
                 found = _given(path) if given else gather(path, content, row.fps, row.topic,
@@ -186,7 +170,7 @@ def _gathered(row: Row, out: str, config: Config, now: str) -> ClipResult:
                     raise InputError('E-CLIP-CHANGED',
                                      f'{path} changed while it was read: start the command again '
                                      f'when the clip is complete')
-                write(joined(out, name), encoded(found))
+                storage.write(storage.joined(out, name), scene_file.encoded(found))
         except InputError as error:
             # the tables must not depend on where the clip, or its copy, lies
             raise InputError(error.code, str(error).replace(str(path), row.clip)) from error
@@ -198,17 +182,16 @@ def _gathered(row: Row, out: str, config: Config, now: str) -> ClipResult:
 
 def gathered(out: str, name: str) -> SceneFile | None:
     """Return turns that were gathered before; None where there are none, or they are damaged."""
-    data = read(joined(out, name))
+    data = storage.read(storage.joined(out, name))
     try:
-        return None if data is None else decoded(data)
+        return None if data is None else scene_file.decoded(data)
     except ValueError:
         return None
 
 
 def _given(path: Path) -> SceneFile:
-    """Return turns that were gathered elsewhere; raises InputError."""
     try:
-        return decoded(read_file(path, LARGEST))
+        return scene_file.decoded(read_file(path, scene_file.LARGEST))
     except ValueError as error:
         raise InputError('E-GATHERED-DAMAGED',
                          f'{path.name} is not a file of gathered turns ({one_line(error)}); '
@@ -219,7 +202,7 @@ def settings_hash(config: Config, fps: float | None, topic: str | None) -> str:
     """Return a hash of all that a clip's scenes depend on beside its content."""
     used = {name: value for name, value in config.flat().items()
             if not name.startswith(LATER) and name not in LATER_NAMES}
-    return hash_of([FORMAT, GATHERED, used, fps, topic])[:16]
+    return hash_of([scene_file.FORMAT, GATHERED, used, fps, topic])[:16]
 
 
 def content_hash(path: Path) -> str:
@@ -229,7 +212,7 @@ def content_hash(path: Path) -> str:
     """
     found = hashlib.sha256()
     try:
-        for file, about in clip_files(path):
+        for file, about in storage.clip_files(path):
             if file != path:
                 found.update(os.fsencode(file.relative_to(path)) + b'\0')
                 found.update(about.st_size.to_bytes(8, 'big'))

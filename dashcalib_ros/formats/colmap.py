@@ -114,7 +114,6 @@ def database_cameras(path: Path) -> Cameras:
 
 
 def _read(values: Sequence[Any], path: Path) -> Camera | OtherLens:
-    """Return the camera of a line without its number: model, width, height, parameters."""
     if len(values) < 3:
         raise InputError('E-CALIBRATION-COUNT',
                          f'{path} has a line without model, width and height; write it again')

@@ -86,13 +86,12 @@ def camera_with(size: Sequence[Any], view: Sequence[float], kind: str, d: Sequen
     return camera
 
 
-def pinhole(k: Sequence[float], path: object) -> Sizeless:
-    """Return the camera of K (9,), of pictures without distortion whose size is not written."""
-    return Sizeless(lambda size: camera_with(size, focal_and_centre(k), PLUMB_BOB, (), path))
+def pinhole(view: Sequence[float], path: object) -> Sizeless:
+    """Return the camera of fx, fy, cx, cy, of pictures without distortion and without a size."""
+    return Sizeless(lambda size: camera_with(size, view, PLUMB_BOB, (), path))
 
 
 def _check_count(d: Sequence[float], path: object) -> None:
-    """Raise InputError for a number of coefficients that no program writes for a pinhole."""
     if len(d) in COUNTS or not any(d[2:]):
         return
     if len(d) == 3:
@@ -338,7 +337,6 @@ def no_distortion(data: Data, what: str, cure: str, path: object) -> InputError:
 
 
 def _entries(data: Any) -> Iterator[tuple[Any, Any]]:
-    """Yield the keys and values of a file's data, and of what is in it."""
     if isinstance(data, Mapping):
         yield from data.items()
     for each in (data.values() if isinstance(data, Mapping) else

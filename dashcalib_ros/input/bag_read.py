@@ -102,7 +102,6 @@ class _Unpacking:
         self._left = unpacked_limit(path)
 
     def through(self, unpacker: Callable[[bytes, int], bytes], data: bytes) -> bytes:
-        """Return unpacked data, as unpack() does; raises InputError beyond the limit."""
         try:
             plain = unpacker(data, self._left)
         except InputError:
@@ -184,7 +183,6 @@ class _McapReader(storage_mcap.McapReader):
     """rosbags' reader of an MCAP file that has an index; its messages are those of McapFile."""
 
     def read_index(self) -> None:
-        """Read the index; raises InputError beyond limits."""
         if Path(str(self.path)).stat().st_size - self.data_end > INDEX_BYTES:
             raise InputError('E-BAG-INDEX', 'the index is too large')
         super().read_index()
@@ -193,7 +191,6 @@ class _McapReader(storage_mcap.McapReader):
 
     def messages(self, connections: Collection[Connection], *limits: Any
                  ) -> Generator[tuple[Connection, int, bytes], None, None]:
-        """Read all messages; raises InputError where some cannot be read."""
         wanted = {each.id: each for each in connections}
         for _, channel, message in mcap_contents(
                 Path(str(self.path)), refuse, {each.topic for each in connections}):
@@ -214,28 +211,24 @@ class _Ros1Reader(rosbag1.Reader):
     _end = _entries = _index_end = 0
 
     def read_connection(self) -> Connection:
-        """Read a topic; raises InputError beyond limits."""
         assert self.bio is not None
         if Path(str(self.path)).stat().st_size - self.bio.tell() > INDEX_BYTES:
             raise InputError('E-BAG-INDEX', 'the index is too large')
         return super().read_connection()
 
     def read_chunk_info(self) -> rosbag1.ChunkInfo:
-        """Read where a chunk is."""
         info = super().read_chunk_info()
         assert self.bio is not None
         self._index_end = self.bio.tell()
         return info
 
     def read_chunk(self) -> rosbag1.Chunk:
-        """Read a chunk's head; raises InputError where it is a part of the one before."""
         assert self.bio is not None
         if self.bio.tell() < self._end:
             raise InputError('E-BAG-INDEX', 'chunks overlap')
         return super().read_chunk()
 
     def read_index_data(self, pos: int, indexes: dict[int, list[rosbag1.IndexData]]) -> None:
-        """Read where a topic's messages are in a chunk; raises InputError beyond limits."""
         assert self.bio is not None
         head = self.bio.read(INDEX_HEAD)
         self._entries += int.from_bytes(head[-4:], 'little')
@@ -246,7 +239,6 @@ class _Ros1Reader(rosbag1.Reader):
         self._end = self.bio.tell()
 
     def open(self) -> None:
-        """Open the file; its chunks are unpacked within limits."""
         super().open()
         if self._index_end != Path(str(self.path)).stat().st_size:
             self.close()
@@ -259,8 +251,6 @@ class _Ros1Reader(rosbag1.Reader):
 
 
 class _FolderReader(rosbag2.reader.DirectoryReader):
-    """rosbags' reader of a folder with metadata.yaml, within limits."""
-
     STORAGE_PLUGINS: Mapping[str, Any] = {'mcap': _McapReader,
                                           'sqlite3': storage_sqlite3.Sqlite3Reader}
 
@@ -633,7 +623,6 @@ class McapFile:
                 yield (*wanted[message.channel_id], message)
 
     def _find(self) -> None:
-        """Find chunks, and messages that are in none."""
         indexed, end = [], self._size
         for record in _summary(self._file, min(self._size, RECORD_BYTES)):
             if isinstance(record, Schema | Channel):
@@ -739,7 +728,6 @@ class McapFile:
         return sorted(found, key=lambda each: each.log_time)
 
     def _records_in(self, chunk: _Place) -> list[McapRecord]:
-        """Return what is in a chunk; raises nearly anything where it is damaged."""
         self._file.seek(chunk.place)
         record = next(self._records(RECORD_BYTES))
         if not isinstance(record, Chunk):
@@ -751,7 +739,6 @@ class McapFile:
 
 
 def _indexed(chunk: ChunkIndex) -> _Place:
-    """Return a chunk, of its record in the index."""
     end = chunk.chunk_start_offset + chunk.chunk_length
     offsets = sorted((place, channel) for channel, place in chunk.message_index_offsets.items())
     ends = [place for place, _ in offsets[1:]] + [end + chunk.message_index_length]

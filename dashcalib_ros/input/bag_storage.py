@@ -16,7 +16,6 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import starmap
 from pathlib import Path, PurePath
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from dashcalib_ros.arrays import Pixels
@@ -153,16 +152,8 @@ def open_bag(path: Path) -> Bag:
     return Bag(files, topics, indexed, tuple(warnings), metadata.begins_ns)
 
 
-class _Metadata(NamedTuple):
-    """What metadata.yaml lists; begins_ns: of packed files."""
-
-    files: tuple[Path, ...] = ()
-    topics: tuple[Topic, ...] = ()
-    begins_ns: Mapping[Path, int] = MappingProxyType({})
-
-
-def _metadata(path: Path) -> _Metadata:
-    """Return the files and topics that metadata.yaml lists, or nothing if it cannot be used."""
+def _metadata(path: Path) -> Bag:
+    """Return the bag that metadata.yaml lists, an empty one where it cannot be used."""
     try:
         text = read_text(path, YAML_BYTES)
         content = parse_yaml(text, str(path))['rosbag2_bagfile_information']
@@ -178,12 +169,11 @@ def _metadata(path: Path) -> _Metadata:
                   int(each['starting_time']['nanoseconds_since_epoch'])
                   for each in content.get('files') or () if each['path'].endswith('.zstd')}
     except (InputError, KeyError, TypeError, ValueError, OverflowError, AttributeError):
-        return _Metadata()
-    return _Metadata(files, _sorted(counts), begins)
+        return Bag((), (), True, ())
+    return Bag(files, _sorted(counts), True, (), begins)
 
 
 def _typed(topics: tuple[Topic, ...], others: tuple[Topic, ...]) -> tuple[Topic, ...]:
-    """Return topics with the types that others of their name have where theirs is missing."""
     types = {topic.name: topic.msgtype for topic in (*others, *topics) if topic.msgtype}
     counts = Counter[tuple[str, str]]()
     for topic in topics:
@@ -314,7 +304,6 @@ class BagSource(FrameSource):
 
 
 def _of_video(shot: _Shot, frame: Any) -> _Shot:
-    """Return a shot with the picture that its packet led to."""
     return shot._replace(decode=partial(FramePicture(), frame))
 
 
@@ -349,7 +338,6 @@ def _choose(path: Path, bag: Bag, name: str | None) -> Topic:
 
 
 def _check_readable(path: Path, bag: Bag) -> None:
-    """Raise InputError where a bag without image topics has images all the same."""
     filled = [topic for topic in bag.topics if topic.count]
     if untyped := [topic.name for topic in filled if not topic.msgtype]:
         raise InputError(

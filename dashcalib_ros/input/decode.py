@@ -211,7 +211,6 @@ def _is_packed(message: Any) -> bool:
 
 
 def _packed_image(message: Any) -> tuple[Any, bytes]:
-    """Return the image, whose data is still packed, and that; raises InputError for damage."""
     data = bytes(message.data)
     try:
         height, width, big, step, length = struct.unpack_from('<IIBII', data)
@@ -224,10 +223,7 @@ def _packed_image(message: Any) -> tuple[Any, bytes]:
 
 
 def _unpacked(message: Any) -> Any:
-    """Return the image of a message of zstd_image_transport; raises InputError for damage.
-
-    That transport packs by gzip, whatever its name says.
-    """
+    """Return the unpacked image: that transport packs by gzip, whatever its name says."""
     image, packed = _packed_image(message)
     check_pixels(image.width, image.height)
     limit = min(image.height * image.step, PICTURE_BYTES) + 1
@@ -241,7 +237,6 @@ def _unpacked(message: Any) -> Any:
 
 
 def _name(message: Any) -> str:
-    """Return a name for messages about a CompressedImage; raises InputError for other formats."""
     name = ' '.join(str(message.format).split())
     if 'compresseddepth' in name.lower():
         raise InputError('E-IMAGE-DEPTH',
@@ -357,10 +352,7 @@ def _damaged(what: str, size: int) -> InputError:
 
 
 def _pixels(message: Any, layout: _Layout, colour: bool) -> Pixels:
-    """Return (height, width, channels), a view of the message where its bytes allow.
-
-    colour: of planar ones all the rows, those of the colours last.
-    """
+    """Return (height, width, channels); colour: of planar ones all rows, the colours last."""
     width, height, step = int(message.width), int(message.height), int(message.step)
     data = np.frombuffer(message.data, np.uint8)
     check_pixels(width, height)

@@ -269,7 +269,6 @@ class FrameSource(ABC):
         return source
 
     def _cut(self, image: Pixels) -> Pixels:
-        """Return the part of an image that is used. Raises InputError where it sticks out."""
         if self.part is None:
             return image
         left, top, width, height = self.part
@@ -338,7 +337,6 @@ class FrameSource(ABC):
             raise self._no_image(reading)
 
     def _excerpted(self, reading: Reading) -> Generator[Picture, None, None]:
-        """Yield the pictures from the excerpt's start to its end."""
         first_ns: int | None = None
         with closing(self._pictures(reading, self._start_ns)) as pictures:
             for picture in pictures:
