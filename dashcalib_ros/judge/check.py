@@ -280,7 +280,6 @@ def with_lines(found: Check, given: Camera, lines: Lines, image_size: tuple[int,
 
 
 def _lines_text(bent: Bend, against: bool, limit: float) -> str:
-    """Return what lines say, and whether it counts; limit: sigmas from which on it may."""
     what = ('contradict its distortion' if against else
             'do not fit its distortion, but too few pixels to decide' if bent.sigmas > limit else
             'lean against its distortion, but not enough to decide'

@@ -151,7 +151,6 @@ def _found(rule: Rule, grounds: Grounds) -> Finding | None:
 
 
 def _graded(refused: bool, weak: bool) -> Level:
-    """Return the graver level whose condition holds."""
     return 'refused' if refused else 'weak' if weak else 'accepted'
 
 
@@ -233,7 +232,6 @@ def flat_profile(grounds: Grounds) -> Finding:
 
 
 def _has_turn(solution: Solution) -> bool:
-    """Return whether one of the scenes is more than a gentle bend."""
     return any(scene.yaw_deg >= HIDDEN_DEG for scene in solution.scenes)
 
 
@@ -270,7 +268,6 @@ def sigma_too_large(grounds: Grounds) -> Finding:
 
 
 def _relative_sigma(solution: Solution) -> float:
-    """Return the sigma of fx, of fx."""
     return float(solution.sigma[0] / solution.camera.fx)
 
 
@@ -331,7 +328,6 @@ NAMED = 3
 
 
 def _turns(turns: list[TurnId]) -> str:
-    """Return the turns' names, for messages."""
     own = [str(turn.number) for turn in turns if turn.of_this_drive]
     stored = Counter(turn.clip or 'earlier drives' for turn in turns if not turn.of_this_drive)
     names = []

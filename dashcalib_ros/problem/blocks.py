@@ -276,7 +276,6 @@ def bounds_of(camera: Camera, focal_reach: float = FOCAL_BOUND) -> Floats:
 
 
 def _undistorted(camera: Camera) -> Floats:
-    """Return the parameters without distortion and with a centred principal point."""
     return type(camera).centred(camera.image_size, camera.fx).params
 
 

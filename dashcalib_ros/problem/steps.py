@@ -162,11 +162,9 @@ class _Trust:
 
     @property
     def whole(self) -> bool:
-        """Return whether it is trusted everywhere: steps are not damped then."""
         return self.radius == np.inf
 
     def less(self) -> _Trust:
-        """Return the region after a step that did not lower the cost."""
         return _Trust(min(self.radius / self.shrink, FIRST_RADIUS), 2 * self.shrink)
 
     def more(self, worth: float) -> _Trust:
@@ -246,7 +244,6 @@ class _Step:
                    gain + sum(normal.gain for normal in normals) / unit)
 
     def taken(self, now: S, part: float) -> S:
-        """Return the state after a part of the step."""
         imaging, stretches = now.imaging.moved(part * self.shared), []
         for follow, stretch in zip(self.follows, now.stretches, strict=True):
             stretches.append(moved_by(stretch, follow, part))

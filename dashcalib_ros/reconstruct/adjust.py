@@ -122,7 +122,6 @@ def _projected(scenes: Sequence[Scene], camera: Camera) -> list[Scene]:
 
 
 def _with_structure_of(moved: Stretch, scene: Scene) -> Scene:
-    """Return the scene with the poses and points that were adjusted."""
     found = moved.structure
     return replace(scene, structure=replace(
         scene.structure, rotations=found.rotations, translations=found.translations,

@@ -95,7 +95,6 @@ def _spans(scene: Scene, rows: Ints) -> list[Floats]:
 
 
 def _seen(xy: Floats) -> Floats:
-    """Return the tracks (2, t, 2) that are seen at both ends."""
     return xy[:, np.isfinite(xy[:, :, 0]).all(axis=0)]
 
 
@@ -146,13 +145,11 @@ def _alike(spans: Sequence[Floats], other: Scene, starts: Ints, times: Floats) -
 
 
 def _seconds(scene: Scene) -> Floats:
-    """Return (k,) the keyframes' times since the first."""
     stamps = scene.tracks.stamps_ns
     return np.asarray((stamps - stamps[0]) / 1e9)
 
 
 def _yaw_deg(scene: Scene) -> tuple[Floats, Floats]:
-    """Return the times of the registered keyframes and the yaw there, degrees."""
     return _seconds(scene)[scene.structure.registered], scene.yaws_deg
 
 
@@ -171,7 +168,6 @@ def _places_at(scene: Scene, at: Floats) -> Floats:
 
 
 def _cut(scene: Scene, rows: Mask) -> Scene:
-    """Return the scene with these keyframes only."""
     tracks, structure = scene.tracks, scene.structure
     used = structure.used[rows]
     # a point needs two views

@@ -99,7 +99,6 @@ def _fx_alone(c: CalibrationData) -> dict[TurnId, tuple[float, float]]:
 
 
 def _shares(c: CalibrationData) -> dict[TurnId, float]:
-    """Return each turn's share of the information about fx; none of a refused calibration."""
     solution = c.material.solution if c.material and _fx_alone(c) else None
     return {} if solution is None else leverages(solution)
 

@@ -305,7 +305,6 @@ class Learner:
 
     def _push(self, index: int, stamp_ns: int, message: Any, size: tuple[int, int],
               frame_id: str) -> None:
-        """Search an image for turns, and hand it on to who watches."""
         bank = self._now
         try:
             image = mapped_copy(decode_checked(message, size, bank.depth))
@@ -318,7 +317,6 @@ class Learner:
         self._hear(Measured(message.header, status))
 
     def _look(self, bank: _Bank) -> None:
-        """See which turns are built now."""
         try:
             # a camera in use is compared with turns: a stabiliser can hide no turn
             bank.calibrator.scenes.want(self._goal.config.turns.wanted, self._more,
@@ -493,7 +491,6 @@ def beginning(status: Status) -> str:
 
 
 def _error_text(error: Exception) -> str:
-    """Return an error in one line, with its code, or its type if it is not this project's."""
     if isinstance(error, DashcalibError):
         return coded(error, 500)
     return f'{type(error).__name__}: {one_line(error, 500)}'

@@ -76,7 +76,6 @@ class Calibrating:
 
     @property
     def _contradictions(self) -> int:
-        """Return how many calibrations in a row contradict the one in use."""
         return self._kept.contradictions if self._kept else 0
 
     def _trusted(self) -> NamedCamera | None:
@@ -101,7 +100,6 @@ class Calibrating:
             self._sent += 1
 
     def _load(self) -> None:
-        """Use the file's calibration, if it is an accepted one of this node."""
         try:
             kept = self._store.load()
         except InputError as error:
@@ -245,7 +243,6 @@ class Calibrating:
         self._mounting.show(mount, frame_id)
 
     def _drop(self) -> None:
-        """Use no calibration, as at the start; the file stays where it is."""
         if self._info is not None:
             # K[0] = 0 says that it is uncalibrated (sensor_msgs)
             self._latch(CameraInfo(header=self._header(self._info.header.frame_id)))
@@ -254,7 +251,6 @@ class Calibrating:
         self._watch()
 
     def _retire(self) -> tuple[bool, str]:
-        """Move the file aside; return whether it is out of the way, and a line about it."""
         try:
             return True, self._store.retire()
         except OutputError as error:
@@ -284,7 +280,6 @@ class Calibrating:
             return False, f'not saved: {coded(error)}'
 
     def _warnings(self) -> list[str]:
-        """Return warnings about the file and the topic, for the operator."""
         found = [text for text in (self._store.taken, self._store.given_up) if text]
         if self._contradictions:
             found.append(f'{self._contradictions} of {self._own.contradictions} calibrations in '

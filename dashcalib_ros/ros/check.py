@@ -134,7 +134,6 @@ class Checking:
         return True, 'collecting; the calibration of the driver is not changed'
 
     def _warnings(self) -> list[str]:
-        """Return what keeps the calibration from being checked."""
         if self._given is None:
             return [self._problem]
         if self._fits or self._size is None:
@@ -156,7 +155,6 @@ class Checking:
             'check': found.answer, 'check reasons': '; '.join(found.reasons)}, self._warnings())
 
     def _answer(self) -> Check:
-        """Return the answer of the turns, and the faults that need no turn."""
         return with_faults(self._found, self._given.faults if self._given else ())
 
     @property
@@ -177,7 +175,6 @@ class Checking:
             self._take(message, what == 'changed')
 
     def _take(self, message: CameraInfo, changed: bool) -> None:
-        """Check this calibration from now on."""
         topic = self._given_topic
         if changed:
             self._log.warning(f'the calibration on {topic} has changed: it is checked again')

@@ -160,7 +160,6 @@ class Drive:
         return not refused, refused or 'started: /diagnostics and the log have the result'
 
     def _answer(self, success: bool, text: str) -> None:
-        """Tell those who wait for a calibration what became of it."""
         asked, self._asked = self._asked, []
         for each in asked:
             each.set_result((success, text))
@@ -190,7 +189,6 @@ class Drive:
         self._complaints.failure(kind, error)
 
     def _hear(self, news: News) -> None:
-        """Take news from other threads."""
         action = partial(self._on_news, news)
         if isinstance(news, Measured):
             # one comes with each image: it waits for the next one, as waking up takes time
@@ -294,7 +292,6 @@ class Drive:
                 self.on_result(news)
 
     def _on_watched(self, watched: Watched) -> None:
-        """Take what turns say of the camera in use; each change is logged once."""
         if watched.camera is not self._goal.camera or self.held:
             return
         known = self.changes()
@@ -352,7 +349,6 @@ class Drive:
         self._report(self._role.health())
 
     def _report(self, health: Health) -> None:
-        """Publish /diagnostics, and the state that the overlay shows."""
         images, learner, monitor = self.images, self.learner, self.monitor
         now, wanted = learner.activity.status, self._goal.config.turns.wanted
         clock = self._intake.clock
@@ -395,7 +391,6 @@ class Drive:
             self._endpoints.node, 'camera calibration', self._camera_name, level, message, values))
 
     def _namesakes(self) -> list[str]:
-        """Return that another node has this one's name, in at most one line; log that once."""
         node = self._endpoints.node
         own = node.get_name(), node.get_namespace()
         if node.get_node_names_and_namespaces().count(own) < 2:
@@ -407,7 +402,6 @@ class Drive:
         return [text]
 
     def _level(self, health: Health, warnings: list[str]) -> tuple[bytes, str]:
-        """Return the level of /diagnostics and its message: the worst of what is to be said."""
         silent_s = self._intake.silent_s
         if not self.images.listening:
             return WARN, 'inactive: the node subscribes to no images until it is activated'
