@@ -262,10 +262,7 @@ def with_source(calibration: Calibration, source: FrameSource) -> Calibration:
     new = tuple(line for line in source.warnings
                 if line not in (*doubts, *calibration.warnings))
     if doubts:
-        cures = (line.rpartition(': ')[2] for line in doubts)
-        verdict = replace(verdict, reasons=(*doubts, *verdict.reasons),
-                          cures=(*cures, *verdict.cures),
-                          codes=(*(each.code for each in doubts), *verdict.codes))
+        verdict = replace(verdict, reasons=(*doubts, *verdict.reasons))
     if material is not None:
         coloured = spared('the pictures in colour', lost, _in_colour, material, source)
         material = coloured or material

@@ -39,10 +39,12 @@ from dashcalib_ros.solve.evidence import (
 )
 from dashcalib_ros.solve.solution import Solution
 
-# cures that several rules have, or that others look for
+# cures that several rules have
 STEADY = 'switch off the stabiliser and fix the zoom, then record another drive'
 MORE_TURNS = 'drive more and sharper turns, as at crossings, in daylight'
 CORNERS = 'drive where there are things to see up to the corners of the picture'
+# the reason for which a camera in use is given up
+MOVES = 'E-PICTURE-MOVES'
 # for what no camera_info holds
 RAYS = 'use `dashcalib export --to rays`'
 
@@ -126,9 +128,7 @@ def verdict_of(findings: Sequence[Finding]) -> Verdict:
     against = [found for found in findings if found.objects]
     levels = {found.level for found in against}
     return Verdict('refused' if 'refused' in levels else 'weak' if levels else 'accepted',
-                   tuple(f'{found.what}: {found.cure}' for found in against),
-                   tuple(dict.fromkeys(found.cure for found in against)),
-                   tuple(found.code for found in against),
+                   tuple(Notice(found.code, found.what, found.cure) for found in against),
                    tuple(found.condition for found in findings))
 
 
