@@ -246,7 +246,7 @@ FIGURES = (
         *fx_of('fx, px', 'kitti03', 'kitti07'), *fx_of('judged by', 'kitti03', 'kitti07'))),
     Figure(README, '| fx # px; the chessboard has # px | @ |', 'real', (
         *fx_of('fx, px', 'kitti_raw'), *fx_of('judged by', 'kitti_raw'))),
-    Figure(README, '| # of # accepted, the others weak; fx # % off in the median, # % at the '
+    Figure(README, '| # of # accepted, the others weak; fx # % off in the median, # % at '
            'most; no parameter more than # sigma | @ |', 'accuracy', (settings,)),
     Figure(README, '| # of # refused | @ |', 'accuracy', (refused,)),
     Figure(README, '| # videos, # accepted, # of them wrong | @ |', 'attacks', (attacks,)),

@@ -152,7 +152,7 @@ def _longest_edges(image: GreyImage) -> Floats32:
     height = points[:, -1, 1] - points[:, 0, 1]
     return points[np.sort(np.argsort(-height, kind='stable')[:MOST])]
 
-# pictures that are searched at the most; of more, every second one is dropped
+# pictures that are searched at most; of more, every second one is dropped
 IMAGES = 300
 
 
@@ -160,7 +160,7 @@ class LineCollector:
     """Searches a picture every period; keeps points of edges only, never a picture."""
 
     def __init__(self, images: int = IMAGES, beside: bool = False) -> None:
-        """images: that are searched at the most. beside: a thread searches until the next one."""
+        """images: that are searched at most. beside: a thread searches until the next one."""
         self._thread = ThreadPoolExecutor(1) if beside else None
         # what returns the points, once they are found
         self._found: EvenlySpaced[Callable[[], Floats32]] = EvenlySpaced(PERIOD_S, images)

@@ -193,7 +193,7 @@ def size_reason(given: Camera, image_size: tuple[int, int], compare: Compare | N
     theirs = f'{given.image_size[0]}x{given.image_size[1]}'
     text = f'it is for {theirs} pictures, and those of the drive have {width}x{height}'
     if width != height and given.image_size == (height, width):
-        return f'{text}: are width and height exchanged, or the pictures turned by 90 degrees?'
+        return f'{text}: are width and height exchanged, or the pictures rotated by 90 degrees?'
     if same_shape(given.image_size, image_size):
         resize = export_command(name, f'--size {width}x{height}')
         if compare is None:

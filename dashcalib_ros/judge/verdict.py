@@ -463,7 +463,7 @@ def _turned_pictures(grounds: Grounds) -> Finding | None:
         return None
     where, turn = TURNED[quarters]
     return Finding('E-TURNED-PICTURES', 'weak',
-                   f'the pictures are turned by about {abs(roll):.0f}°: the road is at their '
+                   f'the pictures are rotated by about {abs(roll):.0f}°: the road is at their '
                    f'{where}',
                    f'turn them upright (a video: ffmpeg -i IN -vf {turn} OUT.mp4), or use --set '
                    f'verdict.max_roll_deg=180 for a camera that is mounted this way',

@@ -40,7 +40,7 @@ WORTH = 1e-3
 SETTLING = 3
 # steps in a row that lower nothing
 FAILURES = 5
-# of the cost, in units of the noise: by how much a step of what is shared lowers it at the most
+# of the cost, in units of the noise: by how much a step of what is shared lowers it at most
 # where it is the last one, 0.2 of a sigma
 SETTLED = 0.04
 # eigenvalues below this share of the largest, each parameter in its own unit: of a direction that
@@ -109,7 +109,7 @@ class State:
 class Stepping:
     """How to step, and when to end.
 
-    steps: at the most. unit: px^2 of the noise; None: of the residuals. settled: a step that is
+    steps: at most. unit: px^2 of the noise; None: of the residuals. settled: a step that is
     expected to lower the cost by less, by what is shared, is the last one; tolerance: one that
     changes it by a smaller share. radius: in which the linearisation is trusted at first.
     """

@@ -16,7 +16,7 @@ from dashcalib_ros.arrays import Floats, Ints, Mask
 from dashcalib_ros.camera.rotation import rotation_matrices
 from dashcalib_ros.reconstruct.scene import Pose
 
-# samples drawn at the least and at the most: drives have many inliers
+# samples drawn at least and at most: drives have many inliers
 RELATIVE_TRIALS = (50, 1000)
 ABSOLUTE_TRIALS = (10, 100)
 CONFIDENCE = 0.999

@@ -271,7 +271,7 @@ def undistorted(image: Pixels, camera: Camera, rectified: str
 
     camera: of images of this size. The grids are of the same rays: paths of an SVG in px, first
     the bent one of the original, then the straight one. Last comes how far the lens moves a
-    point at the most, px, within 75 degrees of its axis.
+    point at most, px, within 75 degrees of its axis.
     """
     height, width = image.shape[:2]
     with np.errstate(all='ignore'):
