@@ -30,7 +30,7 @@ Source = Callable[[str], list[str]]
 class Figure:
     """A place on a page that says what a table says.
 
-    place: text of the page, once in it; each # is a number, @ the table's commits as its link.
+    place: text of the page, once in it, however wrapped; each # is a number, @ the table's commits as its link.
     sources: what returns the numbers, in their order, from the table's text; [] where it does not.
     """
 
@@ -42,8 +42,8 @@ class Figure:
     @property
     def pattern(self) -> re.Pattern[str]:
         """Return what the place looks like with any figures."""
-        escaped = re.escape(self.place).replace('\\#', NUMBER)
-        return re.compile(escaped.replace('@', rf'\[{COMMITS}\]\({re.escape(self.link)}\)'))
+        spaced = re.escape(self.place).replace('\\ ', r'\s+').replace('\\#', f'({NUMBER})')
+        return re.compile(spaced.replace('@', rf'(\[{COMMITS}\]\({re.escape(self.link)}\))'))
 
     @property
     def link(self) -> str:
@@ -57,12 +57,16 @@ class Figure:
         if len(numbers) != self.place.count('#'):
             raise ValueError(f'{self.table}.md has {numbers} for "{self.place}" of {self.page}')
         commits = f'[{commits_of(table)}]({self.link})'
-        said = re.sub('[#@]', lambda each: commits if each[0] == '@' else numbers.pop(0),
-                      self.place)
-        found, count = self.pattern.subn(lambda _: said, text)
-        if count != 1:
-            raise ValueError(f'{self.page} has {count} places "{self.place}", not one')
-        return found
+        new = [commits if each == '@' else numbers.pop(0)
+               for each in re.findall('[#@]', self.place)]
+        places = [*self.pattern.finditer(text)]
+        if len(places) != 1:
+            raise ValueError(f'{self.page} has {len(places)} places "{self.place}", not one')
+        # lines end where they did
+        for group in reversed(range(len(new))):
+            begin, end = places[0].span(group + 1)
+            text = text[:begin] + new[group] + text[end:]
+        return text
 
 
 def table_of(name: str) -> str:
