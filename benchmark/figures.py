@@ -30,8 +30,9 @@ Source = Callable[[str], list[str]]
 class Figure:
     """A place on a page that says what a table says.
 
-    place: text of the page, once in it, however wrapped; each # is a number, @ the table's commits as its link.
-    sources: what returns the numbers, in their order, from the table's text; [] where it does not.
+    place: text of the page, once in it, however wrapped; each # is a number, @ the table's commits
+    as its link. sources: what returns the numbers, in their order, from the table's text; [] where
+    it does not.
     """
 
     page: str
