@@ -189,7 +189,7 @@ def _refined_relative(rotation: Floats, translation: Floats, before: Floats, aft
     step = _solved(columns * weight[:, None], off / scale * weight)
     rotation = rotation_matrices(-step[None, :3])[0] @ rotation
     translation = translation - step[3:] @ plane
-    return cross(translation[None] / np.linalg.norm(translation))[0] @ rotation
+    return np.asarray(cross(translation[None] / np.linalg.norm(translation))[0] @ rotation)
 
 
 def _refined_absolute(pose: Floats, rays: Floats, points: Floats) -> Floats:
