@@ -282,6 +282,7 @@ class ImageInput:
         self._callback(message)
 
     def _find_video(self) -> None:
+        """Look for the packets of a video."""
         for transport, kind in VIDEOS:
             topic = f'{self.base}{transport}'
             if any(info.topic_type == kind
@@ -298,6 +299,7 @@ class ImageInput:
                 return
 
     def _log_missing(self, topic: str, kind: str) -> None:
+        """Log once that a package is not installed."""
         if self._missing != kind:
             self._missing = kind
             package = kind.partition('/')[0].replace('_', '-')
@@ -349,6 +351,7 @@ class ImageInput:
                                          f'{self._reason()}')
 
     def _reason(self) -> str:
+        """Return why, as far as it is known, and the cure."""
         infos = self._node.get_publishers_info_by_topic(self.topic)
         if not infos:
             found = self._published()
@@ -371,6 +374,7 @@ class ImageInput:
         return f'its {counted(len(infos), "publisher")} sent nothing: check the camera driver'
 
     def _published(self) -> list[str]:
+        """Return the arguments with which the node gets others' images, for a few topics."""
         node = self._node
         own = {name for name, _ in node.get_publisher_names_and_types_by_node(
             node.get_name(), node.get_namespace())}
@@ -393,6 +397,7 @@ def _has_a_name(topic: str, kind: str) -> bool:
 
 
 def _arguments(topic: str, kind: str) -> str:
+    """Return the arguments with which the node gets the images of a topic."""
     return f'-r image_raw:={_base(topic)} -p image_transport:={KINDS[kind]}'
 
 

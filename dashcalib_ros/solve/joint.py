@@ -344,6 +344,7 @@ def _posterior(found: Estimate) -> Posterior:
 
 
 def _drift_of(found: Estimate, posterior: Posterior) -> FocalDrift | None:
+    """Return by how much the focal length changes over the drive; None for a steady one."""
     drift = found.imaging.blocks.get(Drift.name)
     if not isinstance(drift, Drift):
         return None
