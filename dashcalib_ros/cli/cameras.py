@@ -71,7 +71,7 @@ def export(args: argparse.Namespace) -> int:
         readout_ms = readout_ms and readout_ms * camera.image_size[1] / whole.image_size[1]
     keeps = EXPORTS[args.to].keeps if args.to in EXPORTS else ()
     if found.field is not None and 'field' in keeps and camera is not found.camera:
-        raise UsageError('E-FIELD-OF-PART', 'the field over the picture is known for the whole '
+        raise UsageError('E-FIELD-OF-PART', 'the residual distortion is known for the whole '
                          'picture only; omit --size and --crop')
     if args.out is not None:
         check_suffix(args.out, args.to)
@@ -87,7 +87,7 @@ def export(args: argparse.Namespace) -> int:
         others = ', '.join(kind for kind, form in EXPORTS.items() if 'field' in form.keeps)
         warn([Notice(
             'E-EXPORT-FIELD-LOST',
-            f'{found.name} has a field over the picture, for which {args.to} has no place: '
+            f'{found.name} has residual distortion, for which {args.to} has no place: '
             f'without it pixels are off by {np.sqrt(np.mean(lost**2)):.2f} px RMS and '
             f'{lost.max():.2f} px at the worst (of {size_text(found.image_size)}); export to '
             f'{others} to keep it')])

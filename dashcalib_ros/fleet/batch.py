@@ -16,11 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from dashcalib_ros.config import Config
-from dashcalib_ros.errors import ConfigError, InputError, coded
+from dashcalib_ros.errors import ConfigError, InputError
 from dashcalib_ros.fleet import lens_prior, overview, solved, storage, tables
 from dashcalib_ros.fleet.clips import (
     GONE,
-    LONGEST,
     ClipResult,
     gather_clip,
     gathered,
@@ -141,13 +140,13 @@ def _gather_and_solve(cameras: Sequence[Camera], out: str, config: Config, engin
         if isinstance(outcome, DiedError):
             outcome = set_aside(row, out, config)
         elif isinstance(outcome, Exception):
-            outcome = ClipResult(coded(outcome, LONGEST))
+            outcome = ClipResult.without(outcome)
         camera.results[row.number] = outcome
         tell(camera, outcome)
         if len(camera.results) == len(camera.rows):
             camera.clips = tables.clip_rows(camera.name, camera.make, camera.gathered, {})
             # where it has files of earlier, they must not stay as they are
-            if (all(result.problem == GONE for _, result in camera.gathered)
+            if (all(result.code == GONE.code for _, result in camera.gathered)
                     and not storage.stamp(storage.joined(out, tables.camera_folder(camera.name)))):
                 _failed(camera, InputError('E-CLIPS-MISSING',
                                            'none of its clips exists; check the paths'))
@@ -160,7 +159,7 @@ def _gather_and_solve(cameras: Sequence[Camera], out: str, config: Config, engin
 
 def _failed(camera: Camera, error: Exception) -> None:
     camera.own, camera.verdict = None, 'refused'
-    camera.row = tables.failed_row(camera.name, camera.make, camera.clips, coded(error, LONGEST))
+    camera.row = tables.failed_row(camera.name, camera.make, camera.clips, error)
 
 
 def _publish(cameras: Sequence[Camera], found: Mapping[str, lens_prior.ModelPrior], out: str,

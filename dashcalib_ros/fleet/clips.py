@@ -9,7 +9,7 @@ import hashlib
 import json
 import os
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from dashcalib_ros.config import Config
@@ -22,6 +22,7 @@ from dashcalib_ros.errors import (
     Notice,
     OutputError,
     WorkerError,
+    code_of,
     coded,
     one_line,
 )
@@ -39,7 +40,7 @@ from dashcalib_ros.workers.memory import in_a_file
 # settings by which a clip's scenes do not change
 LATER = ('intrinsics.', 'verdict.', 'fleet.', 'known.')
 LATER_NAMES = ('threads', 'rectified', 'turns.store')
-GONE = coded(InputError('E-CLIP-MISSING', 'there is no such file; check the path'))
+GONE = InputError('E-CLIP-MISSING', 'there is no such file; check the path')
 # what is gathered of a clip; 2: its upright lines, too; 3: other stretches than turns
 GATHERED = 3
 # characters of an error in a table, without its code
@@ -52,12 +53,13 @@ BLOCK = 2**20
 class ClipResult:
     """What became of a clip, with columns of the table of clips.
 
-    problem: why there are no gathered turns, '' if there are: in file. stamp: as storage.stamp()
-    before the clip was read; '' for what is tried again the next time. time: of the first turn, s;
-    only a date if the clip has dates. again: this was known before.
+    problem: why there are no gathered turns, '' if there are: in file. code: of that. stamp: as
+    storage.stamp() before the clip was read; '' for what is tried again the next time. time: of
+    the first turn, s; only a date if the clip has dates. again: this was known before.
     """
 
     problem: str = ''
+    code: str = ''
     stamp: str = ''
     file: str | None = None
     content: str | None = None
@@ -71,6 +73,11 @@ class ClipResult:
     warnings: tuple[str, ...] = ()
     again: bool = False
 
+    @classmethod
+    def without(cls, why: Exception | str, stamp: str = '') -> ClipResult:
+        """Return the result of a clip that gives no turns."""
+        return cls(coded(why, LONGEST), code_of(why), stamp)
+
 
 def looked_at(row: Row, out: str, config: Config) -> ClipResult | None:
     """Return what became of a clip that no worker need read; None where one must.
@@ -78,11 +85,11 @@ def looked_at(row: Row, out: str, config: Config) -> ClipResult | None:
     A file of this machine that has gone, or never was, costs two looks and no task.
     """
     if row.problem:
-        return ClipResult(coded(Notice('E-MANIFEST-ROW', row.problem)), again=True)
+        return replace(ClipResult.without(Notice('E-MANIFEST-ROW', row.problem)), again=True)
     if (storage.is_url(row.place) or os.path.lexists(row.place)
             or storage.read(clip_file(row, out, config))):
         return None
-    return ClipResult(GONE)
+    return ClipResult.without(GONE)
 
 
 def gather_clip(row: Row, out: str, config: Config) -> ClipResult:
@@ -96,19 +103,19 @@ def gather_clip(row: Row, out: str, config: Config) -> ClipResult:
         now = storage.stamp(row.place) or ''
         return _earlier(name, out, now) or _noted(name, _gathered(row, out, config, now))
     except InputError as error:
-        return _noted(name, ClipResult(coded(error, LONGEST), now))
+        return _noted(name, ClipResult.without(error, now))
     except OutputError:
         raise
     except DashcalibError as error:  # not the clip's own fault
-        return ClipResult(coded(error, LONGEST))
+        return ClipResult.without(error)
     except OSError as error:
         if error.errno in FULL:
             raise OutputError('E-SCRATCH-FULL',
                               f'no space is left for the copy of a clip ({one_line(error)}); free '
                               f'some, or set TMPDIR to another disk, and start the command again: '
                               f'it continues where it stopped') from error
-        return ClipResult(coded(Notice('E-FILE-ACCESS',
-                                       f'this machine cannot read it: {one_line(error)}')))
+        return ClipResult.without(
+            Notice('E-FILE-ACCESS', f'this machine cannot read it: {one_line(error)}'))
 
 
 def set_aside(row: Row, out: str, config: Config) -> ClipResult:
@@ -117,7 +124,7 @@ def set_aside(row: Row, out: str, config: Config) -> ClipResult:
                         f'its worker process died {config.fleet.attempts} times, and it is set '
                         f'aside; check that the clip is sound and that there is enough memory')
     return _noted(clip_file(row, out, config),
-                  ClipResult(coded(error), storage.stamp(row.place) or ''))
+                  ClipResult.without(error, storage.stamp(row.place) or ''))
 
 
 def clip_file(row: Row, out: str, config: Config) -> str:
@@ -138,7 +145,8 @@ def _earlier(name: str, out: str, now: str) -> ClipResult | None:
     """
     try:
         values = json.loads(storage.read(name) or b'')
-        result = ClipResult(**{**values, 'warnings': tuple(values['warnings']), 'again': True})
+        result = ClipResult(**{**values, 'code': values['code'], 'again': True,
+                               'warnings': tuple(values['warnings'])})
     except (ValueError, KeyError, TypeError):
         return None
     holds = now == result.stamp or (result.file and not now)
@@ -154,7 +162,7 @@ def _noted(name: str, result: ClipResult) -> ClipResult:
 
 def _gathered(row: Row, out: str, config: Config, now: str) -> ClipResult:
     if not now:
-        return ClipResult(GONE)
+        return ClipResult.without(GONE)
     with storage.local_copy(row.place) as path:
         try:
             content = content_hash(path)
@@ -175,7 +183,7 @@ def _gathered(row: Row, out: str, config: Config, now: str) -> ClipResult:
             # the tables must not depend on where the clip, or its copy, lies
             raise InputError(error.code, str(error).replace(str(path), row.clip)) from error
     width, height = found.origin.image_size
-    return ClipResult('', now, name, content, width, height, found.frames, found.seconds,
+    return ClipResult('', '', now, name, content, width, height, found.frames, found.seconds,
                       found.found, len(found.turns),
                       found.turns[0].stamp_s if found.turns else None, found.warnings)
 

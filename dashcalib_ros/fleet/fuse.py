@@ -17,7 +17,7 @@ from dashcalib_ros.detect import Bend, Lines
 from dashcalib_ros.detect.bend import GROUP_S
 from dashcalib_ros.detect.straights import StraightCollector
 from dashcalib_ros.detect.turn import TurnId, is_turn
-from dashcalib_ros.errors import Notice, coded, counted, spared
+from dashcalib_ros.errors import Notice, counted, spared
 from dashcalib_ros.fleet.solved import ClipShare, Estimate, Solved
 from dashcalib_ros.input.source import size_text
 from dashcalib_ros.judge import Verdict
@@ -85,14 +85,13 @@ def _fused(camera: str, make: str, clips: Clips, config: Config) -> Solved:
     calibration = replace(conclude(solution, evidence, config), input_name=camera)
     if solution is None:
         why = _nothing_found(kept)
-        calibration = replace(calibration, verdict=Verdict('refused', (why,), codes=(why.code,)))
+        calibration = replace(calibration, verdict=Verdict('refused', (why,)))
     shares = dict.fromkeys(clips, ClipShare())
-    shares.update({turns[turn].clip: ClipShare(
-        left_out=coded(Notice('E-CLIP-REPEATED',
-                              f'shows the same pictures as {turns[other].clip}')))
+    shares.update({turns[turn].clip: ClipShare.without(
+        Notice('E-CLIP-REPEATED', f'shows the same pictures as {turns[other].clip}'))
         for turn, other in sorted(repeated.items(), reverse=True)})
     shares.update(own)
-    shares.update({name: ClipShare(left_out=coded(why)) for name, why in left_out.items()})
+    shares.update({name: ClipShare.without(why) for name, why in left_out.items()})
     return Solved(camera, make, calibration, _estimate(solution, origin, config, lines), shares)
 
 

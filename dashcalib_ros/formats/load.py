@@ -280,7 +280,7 @@ def _table(path: Path) -> list[Data]:
         return list(table.slice(0, ROWS).to_pylist())
     except Exception as error:  # a damaged file makes Arrow raise nearly anything
         raise InputError('E-CALIBRATION-TABLE',
-                         f'{path} is no table that can be read; copy it again') from error
+                         f'{path} is not a readable table; copy it again') from error
 
 
 def given_camera(given: Given, size: Callable[[], Size | None] = lambda: None) -> NamedCamera:

@@ -24,7 +24,7 @@ from dashcalib_ros.camera.field import TERMS as FIELD_TERMS
 from dashcalib_ros.camera.other import OtherLens
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Bend, TurnId
-from dashcalib_ros.errors import DashcalibError, InputError, Notice, one_line
+from dashcalib_ros.errors import DashcalibError, InputError, Notice, code_of, one_line
 from dashcalib_ros.formats import opencv, ros
 from dashcalib_ros.formats.plausible import check_lens
 from dashcalib_ros.formats.values import (
@@ -157,10 +157,8 @@ def calibration_of(data: Data, camera: Camera | None) -> CalibrationData:
     field, size = data.get('field'), (data['image_size'][0], data['image_size'][1])
     sigma = data.get('sigma')
     return CalibrationData(
-        verdict=Verdict(data['verdict'], tuple(data['reasons']),
-                        codes=tuple(data.get('reason_codes', ())),
-                        conditions=tuple(Condition(**each)
-                                         for each in data.get('conditions', ()))),
+        verdict=Verdict(data['verdict'], _notices(data, 'reasons', 'reason_codes'), tuple(
+            Condition(**each) for each in data.get('conditions', ()))),
         image_size=size, camera=camera,
         sigma=None if sigma is None else {name: math.nan if value is None else float(value)
                                           for name, value in sigma.items()},
@@ -200,7 +198,7 @@ def _held_out_dict(turn: LeftOut) -> dict[str, Any]:
 
 def codes_of(lines: Iterable[str]) -> list[str]:
     """Return the codes of warnings or reasons; '' for a line that is no Notice."""
-    return [line.code if isinstance(line, Notice) else '' for line in lines]
+    return [*map(code_of, lines)]
 
 
 def _notices(data: Any, texts: str, codes: str) -> tuple[Notice, ...]:

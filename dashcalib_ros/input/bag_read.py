@@ -39,7 +39,7 @@ from rosbags.rosbag1 import reader as rosbag1
 from rosbags.rosbag2 import storage_mcap, storage_sqlite3
 from rosbags.typesys.msg import normalize_msgtype
 
-from dashcalib_ros.errors import InputError, one_line
+from dashcalib_ros.errors import InputError, Notice, one_line
 from dashcalib_ros.input.decode import ZSTD_MAGIC
 from dashcalib_ros.input.encodings import CDR, ENCODINGS, PROTOBUF, ROS1, message_of
 from dashcalib_ros.input.source import first_of
@@ -76,6 +76,12 @@ T = TypeVar('T')
 UNPACKERS: dict[str, Callable[[], Any]] = {
     'zstd': zstd.ZstdDecompressor, 'lz4': lz4.frame.LZ4FrameDecompressor,
     'bz2': bz2.BZ2Decompressor}
+
+
+class TooMuchError(apsw.SQLError):
+    """A database has more than a recording has."""
+
+    code = 'E-BAG-TOO-LARGE'
 
 
 def unpack(kind: str, data: bytes, limit: int = CHUNK_BYTES) -> bytes:
@@ -167,7 +173,7 @@ def limited(database: apsw.Connection) -> None:
     database.limit(apsw.SQLITE_LIMIT_LENGTH, MESSAGE_BYTES)
     database.set_progress_handler(endless, PIECE)
     if list(database.execute(_MADE)):
-        raise apsw.SQLError('it contains more than tables')
+        raise TooMuchError('it contains more than tables')
 
 
 def _whole(database: apsw.Connection) -> None:
@@ -176,7 +182,7 @@ def _whole(database: apsw.Connection) -> None:
     size = Path(database.filename).stat().st_size
     [(contents, topics, names)] = database.execute(_SIZES)
     if max(contents, names) > size or topics > TOPICS:
-        raise apsw.SQLError('its rows contain more than the file')
+        raise TooMuchError('its rows contain more than the file')
 
 
 class _McapReader(storage_mcap.McapReader):
@@ -496,7 +502,8 @@ def scan(path: Path, damage: Damage, topics: Collection[str] | None = None) -> I
     elif magic.startswith(_ROS1):
         found_in = scan_bag(path, damage)
     else:
-        damage(f'{path.name} does not have the header of a bag')
+        damage(Notice('E-BAG-NOT-A-RECORDING',
+                      f'{path.name} does not have the header of a bag'))
         return
     yield from (record for record in found_in if topics is None or record.topic in topics)
 
@@ -532,6 +539,10 @@ def has_other_encodings(path: Path) -> bool:
     with path.open('rb') as file:
         return any(isinstance(each, Channel) and each.message_encoding != CDR
                    for each in _summary(file, min(path.stat().st_size, RECORD_BYTES)))
+
+
+def _with_code(damage: str, error: Exception) -> str:
+    return Notice(error.code, damage) if isinstance(error, InputError | TooMuchError) else damage
 
 
 def refuse(damage: str) -> None:
@@ -713,8 +724,8 @@ class McapFile:
             try:
                 message = next(self._records(RECORD_BYTES))
             except McapError as error:
-                self._damage(f'{self._path.name} has a message that is too large '
-                             f'({one_line(error)})')
+                self._damage(Notice('E-BAG-TOO-LARGE', f'{self._path.name} has a message that is '
+                                                       f'too large ({one_line(error)})'))
                 continue
             assert isinstance(message, Message)
             yield message
@@ -723,7 +734,8 @@ class McapFile:
         try:
             found = [each for each in self._records_in(chunk) if isinstance(each, Message)]
         except Exception as error:  # also the unpackers' own errors
-            self._damage(f'{self._path.name} has a damaged chunk ({one_line(error)})')
+            self._damage(_with_code(
+                f'{self._path.name} has a damaged chunk ({one_line(error)})', error))
             return []
         return sorted(found, key=lambda each: each.log_time)
 
@@ -794,11 +806,11 @@ def scan_db3(path: Path, damage: Damage) -> Iterator[Record]:
             for topic, data in database.execute(_ROW, (rows[n], left)):
                 left -= len(data)
                 if left < 0:
-                    raise apsw.SQLError('its rows contain more than the file')
+                    raise TooMuchError('its rows contain more than the file')
                 if topic in topics:
                     yield Record(*topics[topic], times[n], data)
     except apsw.Error as error:
-        damage(f'{path.name}: {one_line(error)}')
+        damage(_with_code(f'{path.name}: {one_line(error)}', error))
     finally:
         database.close()
 
@@ -810,7 +822,7 @@ def scan_bag(path: Path, damage: Damage) -> Iterator[Record]:
         try:
             yield from _bag_messages(file, {}, _Unpacking(path))
         except Exception as error:  # rosbags' errors, and those of what unpacks
-            damage(f'{path.name} is truncated ({one_line(error)})')
+            damage(_with_code(f'{path.name} is truncated ({one_line(error)})', error))
 
 
 def _bag_messages(file: BufferedReader, connections: dict[int, tuple[str, str]],

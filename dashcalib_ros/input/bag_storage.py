@@ -19,7 +19,7 @@ from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
 from dashcalib_ros.arrays import Pixels
-from dashcalib_ros.errors import InputError, Notice, counted
+from dashcalib_ros.errors import InputError, Notice, code_of, counted
 from dashcalib_ros.input.bag_read import (
     Damage,
     Record,
@@ -47,11 +47,9 @@ from dashcalib_ros.limits import YAML_BYTES, check_file, parse_yaml, read_text
 
 CURE = ("repair it ('mcap recover', 'ros2 bag reindex', 'sqlite3 .recover', 'rosbag reindex'), "
         'copy it again, or record it again')
-
-
-# reasons that no repair fixes
 NO_CURE = 'check that it is a recording, then copy it again or record it again'
-NO_RECORDING = re.compile('header of a bag|more than|too large|too many')
+# of problems that no repair fixes
+NO_RECORDING = {'E-BAG-NOT-A-RECORDING', 'E-BAG-TOO-LARGE'}
 # types of image_transport's messages that are not read
 VIDEO_TYPES = re.compile('image_transport|theora|h26[45]')
 # problems of files in a message
@@ -192,7 +190,7 @@ def _topics_of(files: tuple[Path, ...], bag: Path) -> tuple[tuple[Topic, ...], b
         indexed &= by_index
     if problems and not counts:
         why = first_of(problems, TOLD)
-        if all(map(NO_RECORDING.search, problems)):
+        if all(code_of(each) in NO_RECORDING for each in problems):
             raise InputError('E-BAG-NOT-A-RECORDING', f'{bag} cannot be read ({why}): {NO_CURE}')
         raise InputError('E-BAG-DAMAGED', f'{bag} cannot be read ({why}): {CURE}')
     return _sorted(counts), indexed

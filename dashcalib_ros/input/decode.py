@@ -245,7 +245,12 @@ def _name(message: Any) -> str:
         raise InputError('E-IMAGE-VIDEO', f'{name!r} is a video, and one packet of it is not a '
                          f'complete image: set image_transport:=video, or republish it as JPEG '
                          f'(image_transport republish)')
-    return f'{name or "compressed"} image'
+    what = f'{name or "compressed"} image'
+    if (not any(each in what.lower() for each in _FORMATS)
+            and encoded_size(memoryview(message.data)) is None):
+        raise InputError('E-IMAGE-FORMAT', f'the format of {what!r} is not supported: publish or '
+                         f'record it as JPEG or PNG (ros2 run image_transport republish)')
+    return what
 
 
 def decode_file(data: bytes | memoryview, depth: BitDepth | None = None,
@@ -305,10 +310,6 @@ def decode_pixels(data: bytes | memoryview, what: str = 'image', colour: bool = 
 
 def _encoded_size(data: memoryview, what: str) -> tuple[int, int]:
     size = encoded_size(data)
-    if size is None and what.endswith(' image') and not any(
-            each in what.lower() for each in _FORMATS):
-        raise InputError('E-IMAGE-FORMAT', f'the format of {what!r} is not supported: publish or '
-                         f'record it as JPEG or PNG (ros2 run image_transport republish)')
     if size is None:
         raise _damaged(what, len(data))
     check_pixels(*size, what)

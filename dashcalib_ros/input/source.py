@@ -275,7 +275,7 @@ class FrameSource(ABC):
         if (min(left, top) < 0 or min(width, height) < 1 or left + width > image.shape[1]
                 or top + height > image.shape[0]):
             raise InputError('E-CROP-OUTSIDE',
-                             f'{left},{top},{width},{height} is no part of a picture of '
+                             f'{left},{top},{width},{height} is not a part of a picture of '
                              f'{image.shape[1]}x{image.shape[0]}; write X,Y,W,H in px: the top '
                              f'left corner of the part, and its size')
         return image[top:top + height, left:left + width].copy()

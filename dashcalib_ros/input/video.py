@@ -100,7 +100,7 @@ class VideoSource(FrameSource):
             self.contradictions = (Notice(
                 'E-INPUT-CONTRADICTED',
                 f'{path} has {rate:.4g} images per second, but --fps {fps:g} replaces its time '
-                f'stamps: omit --fps unless the time stamps are wrong'),)
+                f'stamps', 'omit --fps unless the time stamps are wrong'),)
         self.length_ns = round(((count or 0) / fps if fps else length_s) * 1e9) or None
 
     @property

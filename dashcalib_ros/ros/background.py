@@ -146,7 +146,7 @@ class Inbox:
             self._filled.notify()
 
     def get(self, wait_s: float) -> Action | None:
-        """Take out what is next; wait for it so long at the most, then return None."""
+        """Take out what is next; wait for it so long at most, then return None."""
         with self._filled:
             if not (self._commands or self._images):
                 self._filled.wait(wait_s)

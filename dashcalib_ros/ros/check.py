@@ -152,7 +152,6 @@ class Checking:
             'check': found.answer, 'check reasons': '; '.join(found.reasons)}, self._warnings())
 
     def _answer(self) -> Check:
-        """Return the answer of the turns, and the faults that need no turn."""
         return with_faults(self._found, self._given.faults if self._given else ())
 
     @property
