@@ -3,6 +3,7 @@
 
     python benchmark/motion.py --data data --single 20
     python benchmark/motion.py --towns 40
+    python benchmark/motion.py --clocks --data data --results
 
 A gyro is made from true poses: 100 Hz, 0.1 deg/s/sqrt(Hz), bias 0.2 deg/s, 40 ms late, mounted at
 any angle; called calibrated to 0.1 %. A better one has 0.01 deg/s/sqrt(Hz), and 0.03 %.
@@ -20,6 +21,8 @@ import numpy as np
 import with_tests  # noqa: F401
 from drives import pictures_of
 from made_motion import town
+from measure import commit
+from measure import table as markdown
 from scipy.spatial.transform import Rotation, RotationSpline
 from solving import with_camera
 
@@ -30,9 +33,11 @@ from dashcalib_ros.demo.vehicle import MARGIN_S
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.inputs import open_frames
 from dashcalib_ros.input.motion import Samples, SensorStream, local_metres
+from dashcalib_ros.input.poses import Poses as TruePoses
+from dashcalib_ros.judge.calibration import Witness
 from dashcalib_ros.judge.gyro_scale import scale_by_gps
 from dashcalib_ros.judge.verdict import judge
-from dashcalib_ros.judge.witnesses import SensorComparison, compare_sensors
+from dashcalib_ros.judge.witnesses import SensorComparison, clock_of_poses, compare_sensors
 from dashcalib_ros.pipeline import Calibrator
 from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.solve.start import scene_with
@@ -126,7 +131,7 @@ def row(drive: Driven, stream: SensorStream, sensor: str = 'gyro',
     informed = found.solution or drive.solution
     verdict = judge(informed, Config().verdict, witnesses=found.witnesses).level
     for kind, said in (('gyro', found.witnesses.gyro), ('GPS', found.witnesses.gps)):
-        if said is None:
+        if said is None or said.fx_percent is None:
             continue
         own = 100 * (drive.solution.camera.fx / drive.truth - 1)
         time = ('' if said.time_offset_s is None or said.time_sigma_s is None else
@@ -149,7 +154,7 @@ def harm(drive: Driven, stream: SensorStream) -> None:
         each for each in scenes if each is not None))
     said = [found.witnesses.gyro for found in (
         asked(drive, scaled(stream, 1.03)), asked(drive, scaled(stream, 1.0), longer))]
-    told = ['' if each is None else
+    told = ['' if each is None or each.fx_percent is None or each.fx_sigma_percent is None else
             f'{abs(each.fx_percent) / each.fx_sigma_percent:.1f} sigma'
             f'{"" if each.agrees else ", contradiction"}' for each in said]
     by_gps = []
@@ -231,15 +236,67 @@ def towns(count: int) -> None:
               f'{np.sqrt(np.mean(off**2)):.2f}, {np.abs(off).max():.1f} |')
 
 
+# s by which stamps are shifted
+PUT_IN = (-0.2, -0.1, -0.04, 0.0, 0.04, 0.1, 0.2)
+
+
+def clocks(data: Path, results: bool) -> None:
+    """Measure how well the offsets of sensors' clocks are found, and that of poses."""
+    rows, beyond = [], 0
+    for drive, stream in real(data):
+        sensors = {'all of it': stream, 'positions alone': SensorStream(position=stream.position),
+                   'speeds alone': SensorStream(speed=stream.speed)}
+        for name, each in sensors.items():
+            if each.empty or len(stream.kinds) == 1:
+                continue
+            found = {kind: [getattr(asked(drive, each.shifted(late_s)).witnesses, kind)
+                            for late_s in PUT_IN] for kind in ('gyro', 'gps', 'odometry')}
+            for kind, said in found.items():
+                if any(said):
+                    rows.append([drive.name, f'{name}: {kind}', *map(_late, said)])
+                    beyond += _beyond(said)
+        if drive.poses is not None:
+            said = [clock_of_poses(drive.solution, TruePoses(
+                drive.poses.rotations, drive.poses.places, drive.poses.times + late_s
+                + drive.start_s), Config()) for late_s in PUT_IN]
+            rows.append([drive.name, 'poses', *map(_late, said)])
+            beyond += _beyond(said)
+    count = len(rows) * len(PUT_IN)
+    text = markdown(['drive', 'sensor', *(f'{1e3 * late_s:+.0f} ms' for late_s in PUT_IN)], rows)
+    text += (f'\n\nBeyond 2 sigma of what was put in, or not found: {beyond} of {count}.\n')
+    print(text)
+    if results:
+        (Path(__file__).parent / 'results' / 'clocks.md').write_text(
+            '# The clocks of sensors\n```bash\npython benchmark/motion.py --clocks --data data '
+            f'--results\n```\nAt {commit()}. Stamps of recorded sensors, and of poses, shifted; '
+            f'what was found, in ms.\n\n{text}')
+
+
+def _late(said: Witness | None) -> str:
+    return ('' if said is None or said.time_offset_s is None or said.time_sigma_s is None else
+            f'{1e3 * said.time_offset_s:+.1f} ± {1e3 * said.time_sigma_s:.1f}')
+
+
+def _beyond(found: Sequence[Witness | None]) -> int:
+    return sum(said is None or said.time_offset_s is None or said.time_sigma_s is None
+               or abs(said.time_offset_s - late_s) > 2 * said.time_sigma_s
+               for late_s, said in zip(PUT_IN, found, strict=True))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--towns', type=int, default=0, help='drives on paper for GPS and gyro')
+    parser.add_argument('--clocks', action='store_true', help='offsets of clocks alone')
+    parser.add_argument('--results', action='store_true', help='write their table into results/')
     parser.add_argument('--data', type=Path)
     parser.add_argument('--seeds', type=int, default=3)
     parser.add_argument('--single', type=int, default=0, help='single turns that are rendered')
     parser.add_argument('--cache', type=Path, default=Path('measured/pictures'),
                         help='where rendered pictures are kept')
     args = parser.parse_args()
+    if args.clocks:
+        clocks(args.data, args.results)
+        return
     if args.towns:
         towns(args.towns)
         return
@@ -278,13 +335,20 @@ def real(data: Path) -> Iterator[tuple[Driven, SensorStream]]:
     yield Driven('kitti03', *solved(open_frames(data / 'kitti03' / 'bag')), 718.2, made), gyro(
         made, 1)
     folder = data / 'kitti07'
-    when = table(folder / 'odom.csv')['stamp_s']
+    own = table(folder / 'odom.csv')
+    when, own_m = own['stamp_s'], np.stack([own[name] for name in ('z_m', 'x_m', 'y_m')], axis=1)
     made = poses_of(when, np.loadtxt(folder / 'poses.txt').reshape(-1, 3, 4))
-    yield Driven('kitti07', *solved(pictures(folder, when)), 701.9, made), gyro(made, 1)
+    rates = np.stack([own[f'{name}_rad_s'] for name in ('wx', 'wy', 'wz')], axis=1)
+    drive = Driven('kitti07', *solved(pictures(folder, when)), 701.9, made)
+    yield drive, gyro(made, 1)
+    yield dataclasses.replace(drive, name='kitti07, odometry', poses=None), SensorStream(
+        rate=Samples(when, rates), speed=Samples(when, own['speed_m_s'][:, None]),
+        position=Samples(when, own_m * [1.0, -1.0, -1.0]))
     folder = data / 'kitti_raw'
     when, own = table(folder / 'images.csv')['stamp_s'], table(folder / 'oxts.csv')
     yield Driven('kitti_raw', *solved(pictures(folder, when)), 984.2439), SensorStream(
         rate=Samples(own['stamp_s'], np.stack([own[name] for name in ('wx', 'wy', 'wz')], axis=1)),
+        speed=Samples(own['stamp_s'], own['vf'][:, None]),
         position=Samples(own['stamp_s'], local_metres(own['lat'], own['lon'], own['alt'])))
 
 

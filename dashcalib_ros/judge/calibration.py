@@ -139,36 +139,41 @@ class Stabiliser:
 
 @dataclass(frozen=True)
 class Witness:
-    """The focal length by a sensor, from the angles of the turns.
+    """What a sensor knows: its clock, and the focal length, from the angles of the turns.
 
     time_offset_s: to subtract from the sensor's stamps; positive: its messages are late.
-    None where it is not known. scale: the sensor's angles over the camera's. fx_percent: by how
-    much fx would have to change to agree with the sensor, of fx; fx_sigma_percent: with what the
-    sensor's own scale may be off. agrees: no contradiction beyond 3 sigmas of both.
-    camera_from_sensor: (3, 3) row by row, from the sensor's axes to the camera's; bias_rad_s: (3,)
-    of the sensor's rates; both None where a sensor has none. scale_by_gps: a gyro's angles over
-    those of GPS headings, and the sigma: taken out of scale; None where they say nothing.
+    drift_ppm: by how much it grows, us in a second. Each is None where it is not known; so is what
+    follows, of a sensor that does not measure angles, or not well enough. scale: the sensor's
+    angles over the camera's. fx_percent: by how much fx would have to change to agree with the
+    sensor, of fx; fx_sigma_percent: with what the sensor's own scale may be off. agrees: no
+    contradiction beyond 3 sigmas of both. camera_from_sensor: (3, 3) row by row, from the sensor's
+    axes to the camera's; bias_rad_s: (3,) of the sensor's rates; both None where a sensor has
+    none. scale_by_gps: a gyro's angles over those of GPS headings, and the sigma: taken out of
+    scale; None where they say nothing.
     """
 
     time_offset_s: float | None
     time_sigma_s: float | None
-    scale: float
-    scale_sigma: float
-    fx_percent: float
-    fx_sigma_percent: float
-    agrees: bool
+    scale: float | None = None
+    scale_sigma: float | None = None
+    fx_percent: float | None = None
+    fx_sigma_percent: float | None = None
+    agrees: bool = True
     camera_from_sensor: tuple[tuple[float, ...], ...] | None = None
     alignment_sigma_deg: float | None = None
     bias_rad_s: tuple[float, ...] | None = None
     scale_by_gps: tuple[float, ...] | None = None
+    drift_ppm: float | None = None
+    drift_sigma_ppm: float | None = None
 
 
 @dataclass(frozen=True)
 class Witnesses:
-    """The sensors that were compared; each None where it is not used."""
+    """The sensors that were compared; each None where it is not used. odometry: of speeds."""
 
     gyro: Witness | None = None
     gps: Witness | None = None
+    odometry: Witness | None = None
 
 
 @dataclass(frozen=True)

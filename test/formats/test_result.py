@@ -38,7 +38,8 @@ def test_stored_turns_are_apart_as_they_count_no_frames_of_this_input():
 def test_witnesses_are_written_and_read_and_told_in_one_line(tmp_path):
     said = Witness(0.04, 0.0006, 1.0012, 0.0011, -0.13, 0.14, True,
                    ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), 0.4, (0.01, 0.0, -0.02))
-    calibration = make_calibration(witnesses=Witnesses(gyro=said))
+    clock = Witness(0.21, 0.02, drift_ppm=30.0, drift_sigma_ppm=90.0)
+    calibration = make_calibration(witnesses=Witnesses(gyro=said, odometry=clock))
     result = strict(result_json(calibration))
     assert result['witnesses']['gps'] is None
     gyro = result['witnesses']['gyro']
@@ -50,8 +51,9 @@ def test_witnesses_are_written_and_read_and_told_in_one_line(tmp_path):
     assert line in report_html(calibration)
     console = Console(width=200, file=io.StringIO())
     console.print(summary(calibration))
-    assert line in console.file.getvalue()
-    assert result_dict(make_calibration())['witnesses'] == {'gyro': None, 'gps': None}
+    assert line in console.file.getvalue() and 'late by 210 ± 20.0 ms' in console.file.getvalue()
+    nothing = result_dict(make_calibration())['witnesses']
+    assert nothing == dict.fromkeys(('gyro', 'gps', 'odometry'))
 
 
 def strict(text):
