@@ -40,6 +40,8 @@ LARGEST_OFFSET_S = 0.5
 # of time, prior sigma of the pace of clocks: what a rate that was given with --fps may be off, as
 # the frames of two real drives are
 PACE = 0.005
+# the same of two crystals: the scale of paths wanders too much to tell more
+CRYSTALS = 1e-4
 # m, prior sigma of the lever arm's components
 LEVER_M = 2.5
 # by how much the scale of a path by pictures, and its heading, wander within a turn, and how long
@@ -48,16 +50,17 @@ WANDER, HEADING_RAD, WANDER_S = 0.03, 0.01, 1.0
 # s; what the offset by paths is not better than: KITTI's positions, whose clock a gyro knows, are
 # -45, -24 and +13 ms off it
 PATH_S = 0.02
+# the same by rotations, of a sensor whose samples have been made of others: KITTI's poses, made of
+# the nearest sample at 100 Hz, are -4 and +8 ms off
+MADE_S = 0.004
 # s; an offset that is known worse is not named, nor is a drift, of time
 LARGEST_SIGMA_S, LARGEST_DRIFT_SIGMA = 0.05, 2e-4
 # fixes in a turn at the least, and s between those that are used
 LEAST_FIXES, APART_S = 5, 0.06
 # sigmas between a path's offset and that of a gyro with the same stamps
 ALIKE = 2.0
-# steps of the fit, those without a pace, and those at which the noises are weighed anew
-STEPS, WITHOUT_PACE, WEIGHED = 14, 6, (4, 9)
-# information of what does not move
-HELD = 1e15
+# steps of the fit, and those at which the noises are weighed anew
+STEPS, WEIGHED = 14, (4, 9)
 # m^2/s of a sensor's random walk, and the variance of one value over that of a second of it
 NOISES, RATIOS = np.logspace(-6, 0, 13), np.logspace(-3, 2, 6)
 
@@ -111,13 +114,10 @@ def offset_of(paths: Sequence[Path], samples: Samples, known: Witness | None = N
         return None
     agrees = (known is not None and known.time_offset_s is not None
               and abs(known.time_offset_s - offset_s) < ALIKE * sigma_s)
-    return known_clock(known) if known is not None and agrees else found
-
-
-def known_clock(witness: Witness) -> Witness:
-    """Return of a witness what it says of its clock."""
-    return Witness(witness.time_offset_s, witness.time_sigma_s, drift_ppm=witness.drift_ppm,
-                   drift_sigma_ppm=witness.drift_sigma_ppm)
+    if known is None or not agrees:
+        return found
+    return Witness(known.time_offset_s, float(np.hypot(known.time_sigma_s or 0.0, MADE_S)),
+                   drift_ppm=known.drift_ppm, drift_sigma_ppm=known.drift_sigma_ppm)
 
 
 def clock(offset_s: float, sigma_s: float, pace: float, pace_sigma: float) -> Witness:
@@ -213,10 +213,9 @@ def _fitted(paths: Sequence[Path], samples: Samples) -> Witness | None:
         if abs(ratio) == 0:
             return None
         params[place], params[place + 1] = np.log(abs(ratio)), np.angle(ratio) if plane else 0.0
-    noises = (1e-3, 1.0)
+    noises, prior = (1e-3, 1.0), np.r_[
+        np.full(2 * len(curves), 1e-6), np.full(2, LEVER_M**-2), 1.0, CRYSTALS**-2]
     for number in range(STEPS):
-        prior = np.r_[np.full(2 * len(curves), 1e-6), np.full(2, LEVER_M**-2), 1.0,
-                      HELD if number < WITHOUT_PACE else PACE**-2]
         target = np.r_[params[:-4], np.zeros(4)]
         when = stamps_s - params[-2] - params[-1] * (stamps_s - middle_s)
         rows = [each for place, curve in zip(own, curves, strict=True)

@@ -30,7 +30,15 @@ from dashcalib_ros.errors import Notice, one_line
 from dashcalib_ros.input.motion import Samples, SensorStream, zone_text
 from dashcalib_ros.input.poses import Poses
 from dashcalib_ros.judge.calibration import Witness, Witnesses
-from dashcalib_ros.judge.clocks import LARGEST_OFFSET_S, PACE, Path, clock, offset_of, paths_of
+from dashcalib_ros.judge.clocks import (
+    LARGEST_OFFSET_S,
+    MADE_S,
+    PACE,
+    Path,
+    clock,
+    offset_of,
+    paths_of,
+)
 from dashcalib_ros.judge.gyro_scale import (
     FIXES,
     HEADING_SIGMA_DEG,
@@ -316,7 +324,8 @@ def clock_of_poses(solution: Solution, poses: Poses, config: Config) -> Witness 
             or abs(fit.gyro.offset_s) >= LARGEST_OFFSET_S):
         return None
     sigmas = np.sqrt(np.diag(fit.covariance))
-    return clock(fit.gyro.offset_s, float(sigmas[7]), fit.gyro.pace, float(sigmas[8]))
+    return clock(fit.gyro.offset_s, float(np.hypot(sigmas[7], MADE_S)), fit.gyro.pace,
+                 float(sigmas[8]))
 
 
 # s between the samples of a rate that is made of poses
@@ -381,6 +390,8 @@ LARGEST_SKEW_S, SKEW_SIGMAS = 0.02, 5.0
 # times what a turn's other steps leave; where an image is missing in a turn of 50 degrees or more
 # one step left 4.7 to 14 times that, and else 4.2 at the most
 LARGEST_JUMP = 4.5
+# a stretch that turns less shows no missing image, but a bump
+JUMPING_DEG = 30.0
 
 
 @dataclass(frozen=True)
@@ -533,7 +544,9 @@ def _fit_gyro(turns: Sequence[Steps], angles: Samples) -> Fit | None:
     return Fit(gyro, covariance, np.linalg.solve(hessian, jacobian.T @ follow)[6],
                1 - float(np.sum(left**2) / np.sum(turned**2)),
                float(np.max(np.abs(own[:, 1]), where=clear, initial=0.0)),
-               max(_largest(each) for each in lefts))
+               max((_largest(each) for turn, each in zip(turns, lefts, strict=True)
+                    if np.degrees(np.linalg.norm(turn.turned.sum(axis=0))) > JUMPING_DEG),
+                   default=0.0))
 
 
 def _largest(left: Floats) -> float:

@@ -349,5 +349,5 @@ def test_the_clock_of_poses_is_found_by_their_rotations(drive):
     poses = Poses(np.array(turned) @ MOUNT.as_matrix(), np.zeros((len(even), 3)),
                   START_S + even + LATE_S)
     found = clock_of_poses(solution, poses, CONFIG)
-    assert abs(found.time_offset_s - LATE_S) < 3 * found.time_sigma_s < 0.01
+    assert abs(found.time_offset_s - LATE_S) < 2 * found.time_sigma_s < 0.01
     assert clock_of_poses(solution, dataclasses.replace(poses, stamps_s=None), CONFIG) is None
