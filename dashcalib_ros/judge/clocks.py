@@ -55,8 +55,9 @@ PATH_S = 0.02
 MADE_S = 0.004
 # s; an offset that is known worse is not named, nor is a drift, of time
 LARGEST_SIGMA_S, LARGEST_DRIFT_SIGMA = 0.05, 2e-4
-# fixes in a turn at the least, and s between those that are used
-LEAST_FIXES, APART_S = 5, 0.06
+# fixes in a turn at the least: with the five of 1 Hz noise is taken for motion; and s between those
+# that are used
+LEAST_FIXES, APART_S = 8, 0.06
 # sigmas between a path's offset and that of a gyro with the same stamps
 ALIKE = 2.0
 # steps of the fit, and those at which the noises are weighed anew
