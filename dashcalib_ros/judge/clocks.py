@@ -55,13 +55,13 @@ PATH_S = 0.02
 MADE_S = 0.004
 # s; an offset that is known worse is not named, nor is a drift, of time
 LARGEST_SIGMA_S, LARGEST_DRIFT_SIGMA = 0.05, 2e-4
-# fixes in a turn at the least: with the five of 1 Hz noise is taken for motion; and s between those
-# that are used
+# fixes in a turn at the least, as with the five of 1 Hz noise is taken for motion; and s between
+# those that are used
 LEAST_FIXES, APART_S = 8, 0.06
 # sigmas between a path's offset and that of a gyro with the same stamps
 ALIKE = 2.0
 # steps of the fit, and those at which the noises are weighed anew
-STEPS, WEIGHED = 14, (4, 9)
+STEPS, WEIGHED = 30, (8, 18)
 # m^2/s of a sensor's random walk, and the variance of one value over that of a second of it
 NOISES, RATIOS = np.logspace(-6, 0, 13), np.logspace(-3, 2, 6)
 
