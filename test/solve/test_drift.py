@@ -2,6 +2,7 @@
 """A focal length that changes with time: found where it does, and not named where it does not."""
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,10 +20,13 @@ MIDDLE = (np.array(SIZE) - 1) / 2
 
 def warming(size: float, count: int = 5) -> list[Scene]:
     """Return turns, a minute apart, whose pictures grow by size from the first to the last."""
-    scenes = scenes_of(count, tracks=150)
-    found = []
-    for n, scene in enumerate(scenes):
-        zoom = 1 + size * (n / (count - 1) - 0.5)
+    return zoomed([1 + size * (n / (count - 1) - 0.5) for n in range(count)])
+
+
+def zoomed(zooms: Sequence[float]) -> list[Scene]:
+    """Return turns, a minute apart, whose pictures are so many times as large."""
+    scenes, found = scenes_of(len(zooms), tracks=150), []
+    for n, (scene, zoom) in enumerate(zip(scenes, zooms, strict=True)):
         tracks = replace(scene.tracks, xy=MIDDLE + (scene.tracks.xy - MIDDLE) * zoom,
                          stamps_ns=scene.tracks.stamps_ns + n * 60 * 10**9)
         found.append(replace(scene, tracks=tracks))
@@ -49,3 +53,26 @@ def test_two_turns_cannot_tell():
 
 def test_a_large_drift_has_no_camera_info():
     assert 'E-FOCAL-LENGTH-DRIFTS' in judge(solved(warming(0.05)), CONFIG.verdict).codes
+
+
+def test_a_step_is_found_at_its_place_with_a_calibration_of_each_side():
+    solution = solved(zoomed([1.0, 1.0, 1.02, 1.02, 1.02]))
+    drift = solution.drift
+    assert drift is not None and drift.step_ns is not None and not drift.linear
+    assert 60e9 < drift.step_ns < 120e9
+    assert abs(drift.size - 0.02 / 1.01) < 3 * drift.sigma < 0.01
+    for part, zoom in zip(solution.parts, (1.0, 1.02), strict=True):
+        assert part is not None and abs(part.camera.fx - zoom * LENS.fx) < 3 * part.sigma[0]
+    for turn, zoom in ((1, 1.0), (3, 1.02)):
+        camera, sigma = solution.at(turn * 60 * 10**9)
+        assert abs(camera.fx - zoom * LENS.fx) < 3 * sigma[0] < 0.01 * LENS.fx
+    assert 'E-FOCAL-LENGTH-STEPS' in judge(solution, CONFIG.verdict).codes
+
+
+def test_a_zoom_has_a_focal_length_at_each_turn():
+    zooms = [1.0, 1.05, 1.2, 1.22, 1.3]
+    solution = solved(zoomed(zooms))
+    assert 'E-FOCAL-LENGTH-DRIFTS' in judge(solution, CONFIG.verdict).codes
+    for turn, zoom in enumerate(zooms):
+        camera, sigma = solution.at(turn * 60 * 10**9 + 10**9)
+        assert abs(camera.fx - zoom * LENS.fx) < 3 * sigma[0] < 0.03 * zoom * LENS.fx
