@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from dataclasses import field as default
 from typing import Any, Literal
 
@@ -165,6 +165,21 @@ class Witness:
     scale_by_gps: tuple[float, ...] | None = None
     drift_ppm: float | None = None
     drift_sigma_ppm: float | None = None
+
+    @property
+    def clock(self) -> dict[str, Any]:
+        """Return what is known of the clock, by the names in result.json."""
+        return {name: getattr(self, name) for name in (
+            'time_offset_s', 'time_sigma_s', 'drift_ppm', 'drift_sigma_ppm')}
+
+    def timed(self, other: Witness) -> Witness:
+        """Return it with the clock of another."""
+        return replace(self, **other.clock)
+
+    def later(self, late_s: float) -> Witness:
+        """Return it where that much was taken off the stamps before."""
+        return self if self.time_offset_s is None else replace(
+            self, time_offset_s=self.time_offset_s + late_s)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ along the way errors have that covariance, across it that of a wandering heading
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import TYPE_CHECKING
 
@@ -25,6 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dashcalib_ros.arrays import Floats, Mask
+from dashcalib_ros.camera.rotation import centres_of
 from dashcalib_ros.input.motion import Samples
 from dashcalib_ros.judge.calibration import Witness
 from dashcalib_ros.problem.observations import main_axis
@@ -77,27 +78,22 @@ class Path:
 
 def paths_of(scenes: Sequence[Scene], start_s: float) -> list[Path]:
     """Return the turns' paths, in the plane in which most is turned. start_s: of the drive."""
-    from scipy.spatial.transform import Rotation
-    parts = []
-    for scene in scenes:
-        rows = scene.observed.keyframes
-        rotations = scene.structure.rotations[rows]
-        centres = -np.einsum('kji,kj->ki', rotations, scene.structure.translations[rows])
-        turned = Rotation.from_matrix(
-            rotations[:-1] @ rotations[1:].transpose(0, 2, 1)).as_rotvec()
-        parts.append((scene.tracks.stamps_ns[rows] / 1e9 - start_s, rotations, centres, turned))
-    if not parts:
+    if not scenes:
         return []
-    axis = main_axis(np.concatenate([turned for *_, turned in parts]))
+    axis = main_axis(np.concatenate([np.diff(scene.turned, axis=0) for scene in scenes]))
     # y points down
-    upwards, found = -axis * np.sign(axis[1] or 1.0), []
-    for stamps_s, rotations, centres, turned in parts:
-        up = np.mean(np.einsum('kji,j->ki', rotations, upwards), axis=0)
+    down, found = axis * np.sign(axis[1] or 1.0), []
+    for scene in scenes:
+        rows = scene.structure.registered
+        rotations = scene.structure.rotations[rows]
+        up = -np.sum(down @ rotations, axis=0)
         up /= np.linalg.norm(up)
         ahead = rotations[0][2] - up * (rotations[0][2] @ up)
         ahead /= np.linalg.norm(ahead)
-        found.append(Path(stamps_s, centres @ ahead + 1j * (centres @ np.cross(up, ahead)),
-                          np.r_[0.0, np.cumsum(turned @ upwards)]))
+        centres = centres_of(rotations, scene.structure.translations[rows])
+        found.append(Path(scene.tracks.stamps_ns[rows] / 1e9 - start_s,
+                          centres @ ahead + 1j * (centres @ np.cross(up, ahead)),
+                          scene.turned @ down))
     return found
 
 
@@ -113,12 +109,20 @@ def offset_of(paths: Sequence[Path], samples: Samples, known: Witness | None = N
     offset_s, sigma_s = found.time_offset_s or 0.0, found.time_sigma_s or np.inf
     if not (sigma_s <= LARGEST_SIGMA_S and abs(offset_s) < LARGEST_OFFSET_S):
         return None
-    agrees = (known is not None and known.time_offset_s is not None
-              and abs(known.time_offset_s - offset_s) < ALIKE * sigma_s)
-    if known is None or not agrees:
+    if (known is None or known.time_offset_s is None
+            or abs(known.time_offset_s - offset_s) >= ALIKE * sigma_s):
         return found
-    return Witness(known.time_offset_s, float(np.hypot(known.time_sigma_s or 0.0, MADE_S)),
-                   drift_ppm=known.drift_ppm, drift_sigma_ppm=known.drift_sigma_ppm)
+    return replace(found.timed(known),
+                   time_sigma_s=float(np.hypot(known.time_sigma_s or 0.0, MADE_S)))
+
+
+def of_steps(apart_s: Floats, ratio: float) -> Floats:
+    """Return (k, k) the covariance of a sensor's steps, over times (k,), by its walk of a second.
+
+    ratio: of the variance of each value at the ends of steps to that of the walk.
+    """
+    count = len(apart_s)
+    return np.diag(apart_s + 2 * ratio) - ratio * (np.eye(count, k=1) + np.eye(count, k=-1))
 
 
 def clock(offset_s: float, sigma_s: float, pace: float, pace_sigma: float) -> Witness:
@@ -180,11 +184,7 @@ class _Rows:
     def whitened(self, noise: float, ratio: float) -> tuple[Floats, Floats, float]:
         """Return both in units of their noise, and the log of its size."""
         from scipy.linalg import solve_triangular
-        covariance = self.wanders + np.diag(noise * (self.apart_s + 2 * ratio))
-        off = np.arange(len(self.left) - 1)
-        covariance[off, off + 1] -= noise * ratio
-        covariance[off + 1, off] -= noise * ratio
-        root = np.linalg.cholesky(covariance)
+        root = np.linalg.cholesky(self.wanders + noise * of_steps(self.apart_s, ratio))
         white = solve_triangular(root, np.c_[self.left, self.by_params], lower=True)
         return white[:, 0], white[:, 1:], float(np.log(np.diag(root)).sum())
 

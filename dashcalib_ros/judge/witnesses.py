@@ -36,6 +36,7 @@ from dashcalib_ros.judge.clocks import (
     PACE,
     Path,
     clock,
+    of_steps,
     offset_of,
     paths_of,
 )
@@ -95,6 +96,7 @@ def compare_sensors(solution: Solution | None, stream: SensorStream | None, star
             f'could be compared with') for name in unused)))
     scenes = [scene for scene in solution.scenes if scene.turn.of_this_drive]
     gyro = gps = odometry = informed = None
+    late_s = 0.0
     notices: list[Notice | None] = list(stream.warnings)
     try:
         loss_px = loss_px_of(solution.scenes, solution.camera, config.intrinsics)
@@ -103,7 +105,7 @@ def compare_sensors(solution: Solution | None, stream: SensorStream | None, star
                  and (steps := steps_of(scene, solution, loss_px, start_s)) is not None]
         apart = {kind: words for kind, samples in stream.kinds.items()
                  if (words := _apart(samples, turns))}
-        late_s, own, doubt_s = 0.0, None, stream.doubt_s
+        own, doubt_s = None, stream.doubt_s
         if stream.rate is not None and doubt_s and turns:
             late_s = _late_s(turns, stream.rate, doubt_s)
             stream = stream.shifted(-late_s)
@@ -114,7 +116,6 @@ def compare_sensors(solution: Solution | None, stream: SensorStream | None, star
             gyro, notice = _gyro(fit, solution, own, apart.get('rate', ''))
             if gyro is not None:
                 doubt_s = 0.0
-                gyro = replace(gyro, time_offset_s=(gyro.time_offset_s or 0.0) + late_s)
             notices += [own.contradiction, notice]
             if fit is not None and gyro is not None and gyro.agrees:
                 informed, notice = _informed(solution, fit, own, config)
@@ -125,7 +126,10 @@ def compare_sensors(solution: Solution | None, stream: SensorStream | None, star
             # it has its use where it tells the gyro's scale
             notices.append(None if own is not None and own.by_gps else notice)
         if turns and not doubt_s:
-            gps, odometry = _with_clocks(stream, gyro, gps, paths_of(scenes, start_s), late_s)
+            paths = paths_of(scenes, start_s)
+            odometry = _clock_of(stream.speed, stream, gyro, paths)
+            by_fixes = _clock_of(stream.position, stream, gyro, paths)
+            gps = gps.timed(by_fixes) if gps and by_fixes else gps or by_fixes
         if 'speed' in apart:
             notices.append(Notice('E-SPEED-NO-SAMPLES', f'the speed is not used: it has no '
                                   f'samples during the turns, {apart["speed"]}'))
@@ -134,29 +138,19 @@ def compare_sensors(solution: Solution | None, stream: SensorStream | None, star
             'E-SENSORS-NOT-COMPARED',
             f'the motion sensors could not be compared with the turns ({one_line(error)})'))
     kept = solution if informed is None or (gps is not None and not gps.agrees) else informed
-    return SensorComparison(kept, Witnesses(gyro, gps, odometry), tuple(filter(None, notices)))
+    return SensorComparison(kept, Witnesses(*(
+        each and each.later(late_s) for each in (gyro, gps, odometry))),
+        tuple(filter(None, notices)))
 
 
-def _with_clocks(stream: SensorStream, gyro: Witness | None, gps: Witness | None,
-                 paths: Sequence[Path], late_s: float
-                 ) -> tuple[Witness | None, Witness | None]:
-    """Return GPS and odometry with their clocks. late_s: what was taken off all stamps before."""
-    found: list[Witness | None] = []
-    for samples in (stream.position, stream.speed):
-        if samples is None:
-            found.append(None)
-            continue
-        alike = stream.rate is not None and bool(np.isin(
-            samples.stamps_s, stream.rate.stamps_s).mean() > ONE_CLOCK)
-        known = gyro if alike else None
-        known = known and replace(known, time_offset_s=(known.time_offset_s or 0.0) - late_s)
-        clock = offset_of(paths, samples, known)
-        found.append(clock and replace(clock, time_offset_s=(clock.time_offset_s or 0.0) + late_s))
-    position, speed = found
-    if gps is None or position is None:
-        return gps or position, speed
-    return replace(gps, time_offset_s=position.time_offset_s, time_sigma_s=position.time_sigma_s,
-                   drift_ppm=position.drift_ppm, drift_sigma_ppm=position.drift_sigma_ppm), speed
+def _clock_of(samples: Samples | None, stream: SensorStream, gyro: Witness | None,
+              paths: Sequence[Path]) -> Witness | None:
+    """Return the clock of positions or of speeds; None where the turns do not tell."""
+    if samples is None:
+        return None
+    alike = stream.rate is not None and bool(np.isin(
+        samples.stamps_s, stream.rate.stamps_s).mean() > ONE_CLOCK)
+    return offset_of(paths, samples, gyro if alike else None)
 
 
 # share of samples with the stamps of another sensor; with more they are of the same clock
@@ -285,11 +279,9 @@ def _gyro(fit: Fit | None, solution: Solution, own: _OwnScale, apart: str
             f'the gyro is not used: its time stamps and those of the pictures do not keep pace '
             f'({fit.out_of_pace}): check --fps, and whether images are missing')
     sigmas = np.sqrt(np.diag(fit.covariance))
-    time = clock(gyro.offset_s, float(sigmas[7]), gyro.pace, float(sigmas[8]))
     witness = _witness(gyro.inverse_scale, float(sigmas[6]), own.sigma, fit.by_camera, solution)
     return replace(
-        witness, time_offset_s=time.time_offset_s, time_sigma_s=time.time_sigma_s,
-        drift_ppm=time.drift_ppm, drift_sigma_ppm=time.drift_sigma_ppm,
+        witness.timed(clock(gyro.offset_s, float(sigmas[7]), gyro.pace, float(sigmas[8]))),
         camera_from_sensor=tuple(tuple(row) for row in gyro.alignment.tolist()),
         alignment_sigma_deg=float(np.degrees(np.sqrt(np.trace(fit.covariance[:3, :3])))),
         bias_rad_s=tuple(gyro.bias.tolist()), scale_by_gps=own.by_gps), None
@@ -635,11 +627,7 @@ def _whitening(turn: Steps, ratio: float) -> tuple[Floats, float]:
 
     ratio: of the variance of a keyframe's pose to that of the gyro in a second.
     """
-    apart = np.diff(turn.stamps_s)
-    covariance = np.diag(apart + 2 * ratio)
-    for place in range(len(apart) - 1):
-        covariance[place, place + 1] = covariance[place + 1, place] = -ratio
-    root = np.linalg.cholesky(covariance)
+    root = np.linalg.cholesky(of_steps(np.diff(turn.stamps_s), ratio))
     return np.linalg.inv(root), float(np.log(np.diag(root)).sum())
 
 

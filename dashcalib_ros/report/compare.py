@@ -104,10 +104,6 @@ def mount_dict(mount: Mount | None, other: Mount | None) -> dict[str, Any] | Non
         for name, (degrees, sigma) in mount.apart(other).items()}}
 
 
-# what is told of the clock of poses, by the names in result.json
-CLOCK = ('time_offset_s', 'time_sigma_s', 'drift_ppm', 'drift_sigma_ppm')
-
-
 def answer_dict(found: Check, changes: Sequence[str], motion: Odometry | None = None,
                 mount: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Return the answer of a drive about a given calibration as types of strict JSON.
@@ -118,8 +114,7 @@ def answer_dict(found: Check, changes: Sequence[str], motion: Odometry | None = 
     values: dict[str, Any] = found.to_dict() | {
         'next_step': found.next_step, 'changes': list(changes), 'mount': mount}
     if motion is not None:
-        values |= motion.medians() | {'clock': None if motion.clock is None else {
-            name: getattr(motion.clock, name) for name in CLOCK}}
+        values |= motion.medians() | {'clock': motion.clock and motion.clock.clock}
         values['turns'] = [{'center': turn.turn.number, 'true_deg': turn.angle_deg,
                             'length_m': turn.length_m,
                             'rotation_deg': {name: turn.rotation_deg(name)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import accumulate
 from operator import itemgetter
 from typing import Literal
 
@@ -325,9 +325,11 @@ def drifting(found: Estimate) -> Drift | None:
         scene.tracks.stamps_ns for scene in found.scenes if scene.turn.of_this_drive))
     if len(turns) < LEAST_DRIFTING:
         return None
-    steps = tuple((end + begin) // 2 for (_, end), (begin, _) in pairwise(turns))
-    asked = Drift(np.zeros(1 + len(steps)), turns[0][0], max(end for _, end in turns),
-                  STEADY, steps_ns=steps)
+    begins, ends = [begin for begin, _ in turns], [*accumulate((end for _, end in turns), max)]
+    # where turns overlap nothing steps between them
+    steps = tuple((end + begin) // 2 for end, begin in zip(ends, begins[1:], strict=False)
+                  if end < begin)
+    asked = Drift(np.zeros(1 + len(steps)), begins[0], ends[-1], STEADY, steps_ns=steps)
     now = found.with_tracks(FIRST_TRACKS).having(asked)
     loss_px = now.loss_px()
     unit = now.noise(loss_px).variance * now.inflation

@@ -369,17 +369,6 @@ def _posterior(found: Estimate) -> Posterior:
     return known.erring_together(GENTLE_SHIFTED if found.moves else GENTLE) if gentle else known
 
 
-def _drift_of(found: Estimate, posterior: Posterior) -> FocalDrift | None:
-    """Return by how much the focal length changes over the drive; None for a steady one."""
-    drift = found.imaging.blocks.get(Drift.name)
-    if not isinstance(drift, Drift):
-        return None
-    place = found.imaging.places[Drift.name]
-    grows = np.diff(drift.grown_at(np.array([drift.begin_ns, drift.end_ns])), axis=0)[0]
-    return FocalDrift(float(grows @ drift.value), float(np.sqrt(
-        grows @ posterior.covariance[place, place] @ grows)), drift)
-
-
 def _solution(found: Estimate, unlike: Mapping[TurnId, float], coarse: Profile,
               tried: tuple[Candidate, ...], tests: tuple[FixedCameraTest, ...],
               progress: Progress) -> Solution:
@@ -396,10 +385,11 @@ def _solution(found: Estimate, unlike: Mapping[TurnId, float], coarse: Profile,
     count = len(result.camera.params)
     place, centred = found.imaging.places[Readout.name], found.centred
     shift = found.imaging.blocks.get(Shift.name, Shift())
+    drift = found.imaging.blocks.get(Drift.name)
     assert isinstance(shift, Shift)
     return Solution(
         written=result, posterior=posterior, scenes=scenes, coarse=coarse, around=around,
-        drift=_drift_of(found, posterior),
+        drift=FocalDrift.of(drift, posterior.covariance) if isinstance(drift, Drift) else None,
         centred=type(result.camera).centred(
             lens.image_size, centred.fx, *centred.params[4:min(count, 6)]),
         bounds=bounds_of(centred)[:, :count],

@@ -34,6 +34,18 @@ class FocalDrift:
     sigma: float
     ways: Drift
 
+    @classmethod
+    def of(cls, ways: Drift, covariance: Floats) -> FocalDrift:
+        """Return what these ways add up to. covariance: of what turns share, ways' at its end."""
+        grows = np.diff(ways.grown_at(np.array([ways.begin_ns, ways.end_ns])), axis=0)[0]
+        own = covariance[-len(grows):, -len(grows):]
+        return cls(float(grows @ ways.value), float(np.sqrt(grows @ own @ grows)), ways)
+
+    def moved(self, step: Floats, covariance: Floats) -> FocalDrift:
+        """Return it after a step (m,) of what turns share, with the covariance then."""
+        value = self.ways.value
+        return self.of(replace(self.ways, value=value + step[-len(value):]), covariance)
+
     @property
     def seconds(self) -> float:
         """Return the time from the first turn's begin to the last one's end."""
@@ -249,7 +261,9 @@ def with_measurement(solution: Solution, along: Floats, apart: float, variance: 
     moved = replace(known, further=(*known.further, further))
     step, place = moved.offset - known.offset, len(known.lens.params)
     return replace(
-        solution, posterior=moved, readout_s=solution.readout_s + float(step[place]),
+        solution, posterior=moved,
+        drift=solution.drift and solution.drift.moved(step, moved.covariance),
+        readout_s=solution.readout_s + float(step[place]),
         readout_sigma_s=float(np.sqrt(moved.covariance[place, place])),
         written=replace(solution.written, camera=solution.camera.with_params(
             solution.camera.params + solution.written.by_solution @ step)))

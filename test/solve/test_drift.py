@@ -12,6 +12,7 @@ from synthetic import LENS, SIZE
 
 from dashcalib_ros.judge.verdict import judge
 from dashcalib_ros.reconstruct.scene import Scene
+from dashcalib_ros.solve.solution import with_measurement
 
 pytestmark = pytest.mark.usefixtures('no_profile')
 
@@ -43,6 +44,18 @@ def test_a_lens_that_warms_up_is_measured(size):
     assert 'E-FOCAL-LENGTH-DRIFTS' not in judge(solution, CONFIG.verdict).codes
 
 
+def test_what_is_known_of_a_drift_moves_it():
+    solution = solved(warming(0.02))
+    along = np.eye(len(solution.posterior.prior.score))[-1]
+    found = with_measurement(solution, along, 0.001, 1e-12)
+    assert found.drift is not None and solution.drift is not None
+    assert found.drift.size == pytest.approx(solution.drift.size + 0.001, abs=1e-6)
+    assert found.drift.sigma < 1e-5
+    last_ns = solution.drift.ways.end_ns
+    grown = found.at(last_ns)[0].fx / found.camera.fx
+    assert grown == pytest.approx(1 + found.drift.size / 2)
+
+
 def test_a_steady_lens_has_no_drift():
     assert solved(warming(0.0)).drift is None
 
@@ -67,6 +80,17 @@ def test_a_step_is_found_at_its_place_with_a_calibration_of_each_side():
         camera, sigma = solution.at(turn * 60 * 10**9)
         assert abs(camera.fx - zoom * LENS.fx) < 3 * sigma[0] < 0.01 * LENS.fx
     assert 'E-FOCAL-LENGTH-STEPS' in judge(solution, CONFIG.verdict).codes
+
+
+def test_nothing_steps_between_turns_that_overlap():
+    first, *others = zoomed([1.0, 1.05, 1.05])
+    apart_ns = int(others[0].tracks.stamps_ns[0])
+    within = [replace(scene, tracks=replace(
+        scene.tracks, stamps_ns=(scene.tracks.stamps_ns - n * apart_ns) // 2 + 10**9))
+        for n, scene in enumerate(others, 1)]
+    found = solved([first, *within])
+    assert found.drift is None or found.drift.linear
+    assert found.parts == ()
 
 
 def test_a_zoom_has_a_focal_length_at_each_turn():
