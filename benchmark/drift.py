@@ -138,7 +138,7 @@ def summary(name: str, rows: Sequence[dict[str, Any]]) -> list[str]:
 def main() -> None:
     """Measure."""
     args = parser_with(__doc__, 'seeds', 'again', seeds=range(10)).parse_args()
-    path = args.out / 'drift.json'
+    path, at = args.out / 'drift.json', commit()
     known, found = load(path), dict[str, list[dict[str, Any]]]()
     for seed in args.seeds:
         camera = camera_of(seed)
@@ -146,7 +146,7 @@ def main() -> None:
             key = f'{case.name}, camera {seed}'
             if key not in known or args.again:
                 solution = solve(drive(camera, case.zoom, seed, case.apart_s), Config())
-                known[key] = {'commit': commit(), **(
+                known[key] = {'commit': at, **(
                     {} if solution is None else row_of(case, camera, solution))}
                 save(path, known)
                 complain(f'{key}: {known[key]}')

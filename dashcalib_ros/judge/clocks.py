@@ -136,37 +136,30 @@ def clock(offset_s: float, sigma_s: float, pace: float, pace_sigma: float) -> Wi
 class _Curve:
     """A path as a function of the time of the pictures; of a way, along the car's heading."""
 
-    begin_s: float
-    end_s: float
     places: CubicSpline
     yaw: CubicSpline
 
     def inside(self, when: Floats) -> Mask:
         """Return which of the times (n,) are those of the path."""
-        return np.asarray((when > self.begin_s) & (when < self.end_s))
+        return np.asarray((when > self.yaw.x[0]) & (when < self.yaw.x[-1]))
 
 
 def _curves(paths: Sequence[Path], plane: bool) -> list[_Curve]:
     """Return the paths; where not plane, the way forwards along each."""
     from scipy.interpolate import CubicSpline
+    from scipy.linalg import block_diag
     ways = [np.diff(path.places) * np.exp(-0.5j * (path.yaw[1:] + path.yaw[:-1]))
             for path in paths]
     if not plane and ways:
         # a camera before the rear axle goes sideways where it turns; what is left of sideways
         # motion is that of a camera that does not look ahead
-        design = np.zeros((sum(map(len, ways)), 1 + len(ways)))
-        place = 0
-        for n, (path, way) in enumerate(zip(paths, ways, strict=True)):
-            rows, length = slice(place, place + len(way)), float(np.abs(way).sum())
-            design[rows, 0], design[rows, 1 + n] = way.real / length, np.diff(path.yaw)
-            place += len(way)
-        aside = np.concatenate([way.imag / np.abs(way).sum() for way in ways])
-        ahead = np.arctan(np.linalg.lstsq(design, aside, rcond=None)[0][0])
+        each = np.concatenate([way / np.abs(way).sum() for way in ways])
+        turned = block_diag(*(np.diff(path.yaw)[:, None] for path in paths))
+        ahead = np.arctan(np.linalg.lstsq(np.c_[each.real, turned], each.imag, rcond=None)[0][0])
         ways = [(way * np.exp(-1j * ahead)).real for way in ways]
-    return [_Curve(float(path.stamps_s[0]), float(path.stamps_s[-1]),
-                   CubicSpline(path.stamps_s, path.places if plane else np.r_[
-                       0.0, np.cumsum(way)]), CubicSpline(path.stamps_s, path.yaw))
-            for path, way in zip(paths, ways, strict=True)]
+    return [_Curve(*(CubicSpline(path.stamps_s, values) for values in (
+        path.places if plane else np.r_[0.0, np.cumsum(way)], path.yaw)))
+        for path, way in zip(paths, ways, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -195,9 +188,8 @@ def _fitted(paths: Sequence[Path], samples: Samples) -> Witness | None:
     curves, middle_s = _curves(paths, plane), float(np.mean([
         path.stamps_s.mean() for path in paths])) if paths else 0.0
     samples = samples if plane else samples.integral
-    kept = np.unique(np.searchsorted(samples.stamps_s, np.arange(
-        samples.stamps_s[0], samples.stamps_s[-1] + APART_S, APART_S)).clip(
-            max=len(samples.stamps_s) - 1))
+    kept = np.unique(np.floor((samples.stamps_s - samples.stamps_s[0]) / APART_S),
+                     return_index=True)[1]
     stamps_s = samples.stamps_s[kept]
     values = samples.values[kept, 0] + 1j * (samples.values[kept, 1] if plane else 0.0)
     curves = [curve for curve in curves if curve.inside(stamps_s).sum() >= LEAST_FIXES]
@@ -237,9 +229,8 @@ def _fitted(paths: Sequence[Path], samples: Samples) -> Witness | None:
     sigmas = np.sqrt(np.diag(np.linalg.inv(hessian)))
     worse = max(_scatter(white), 1.0)
     return clock(float(params[-2]), float(np.hypot(worse * sigmas[-2], PATH_S)),
-                 float(params[-1]), float(worse * sigmas[-1]) + PATH_S / (
-                     max(curve.end_s for curve in curves)
-                     - min(curve.begin_s for curve in curves)))
+                 float(params[-1]), float(worse * sigmas[-1]) + PATH_S / float(
+                     np.ptp(np.concatenate([curve.yaw.x for curve in curves]))))
 
 
 def _rows(curve: _Curve, params: Floats, place: int, stamps_s: Floats, when: Floats,

@@ -308,10 +308,10 @@ def clock_of_poses(solution: Solution, poses: Poses, config: Config) -> Witness 
     if poses.stamps_s is None:
         return None
     start_s = float(poses.stamps_s[0])
-    rate = _rate_of(poses.stamps_s - start_s, poses.rotations)
     loss_px = loss_px_of(solution.scenes, solution.camera, config.intrinsics)
     turns = [steps_of(scene, solution, loss_px, start_s) for scene in solution.scenes
              if scene.turn.of_this_drive and len(scene.observed.keyframes) >= LEAST_KEYFRAMES]
+    rate = _rate_of(poses.stamps_s - start_s, poses.rotations, turns)
     fit = None if len(rate.stamps_s) < LEAST_KEYFRAMES else fit_to(turns, rate)
     if (fit is None or fit.out_of_pace or not fit.explained >= LEAST_EXPLAINED
             or abs(fit.gyro.offset_s) >= LARGEST_OFFSET_S):
@@ -325,11 +325,17 @@ def clock_of_poses(solution: Solution, poses: Poses, config: Config) -> Witness 
 POSES_S = 0.01
 
 
-def _rate_of(stamps_s: Floats, rotations: Floats) -> Samples:
-    """Return the rates about its own axes of what has these rotations (n, 3, 3) to the world."""
+def _rate_of(stamps_s: Floats, rotations: Floats, turns: Sequence[Steps]) -> Samples:
+    """Return how fast what has these rotations (n, 3, 3) to the world turned, about its own axes.
+
+    Only about the time of the turns: poses may be years apart.
+    """
     from scipy.interpolate import CubicSpline
     angles = np.cumsum(np.pad(_turned(rotations.transpose(0, 2, 1)), ((1, 0), (0, 0))), axis=0)
-    when = np.arange(stamps_s[0], stamps_s[-1], POSES_S)
+    when = np.unique(np.concatenate([np.zeros(0), *(np.arange(
+        turn.stamps_s[0] - LARGEST_OFFSET_S, turn.stamps_s[-1] + LARGEST_OFFSET_S, POSES_S)
+        for turn in turns)]))
+    when = when[(when >= stamps_s[0]) & (when < stamps_s[-1])]
     after = np.searchsorted(stamps_s, when, side='right')
     when = when[np.diff(stamps_s)[after - 1] <= LONGEST_GAP_S]
     return Samples(when, CubicSpline(stamps_s, angles)(when, 1))

@@ -54,6 +54,13 @@ def test_a_straight_at_one_speed_tells_nothing():
     assert offset_of([], Samples(stamps, np.outer(8 * stamps, [1.0, 0.0, 0.0]))) is None
 
 
+def test_a_fix_of_another_millennium_takes_no_memory():
+    paths, fixes = driven(0, 0.04)
+    more = Samples(np.r_[fixes.stamps_s, 1e11], np.r_[fixes.values, fixes.values[-1:]])
+    found = offset_of(paths, more)
+    assert found.time_offset_s == pytest.approx(offset_of(paths, fixes).time_offset_s, abs=1e-4)
+
+
 def test_a_gyro_with_the_same_stamps_knows_better_where_it_agrees():
     gyro = Witness(0.041, 0.001, 1.0, 0.002, 0.1, 0.2, True, drift_ppm=20.0, drift_sigma_ppm=40.0)
     paths, fixes = driven(0, 0.04)

@@ -353,3 +353,8 @@ def test_the_clock_of_poses_is_found_by_their_rotations(drive):
     found = clock_of_poses(solution, poses, CONFIG)
     assert abs(found.time_offset_s - LATE_S) < 2 * found.time_sigma_s < 0.01
     assert clock_of_poses(solution, dataclasses.replace(poses, stamps_s=None), CONFIG) is None
+    # one that is thousands of years later takes no memory
+    later = Poses(np.r_[poses.rotations, poses.rotations[-1:]], np.zeros((len(even) + 1, 3)),
+                  np.r_[poses.stamps_s, 1e11])
+    again = clock_of_poses(solution, later, CONFIG)
+    assert again.time_offset_s == pytest.approx(found.time_offset_s, abs=1e-4)
