@@ -1,73 +1,223 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""What pieces of real drives without a sharp turn know of the focal length.
+"""What drives without a sharp turn know of the focal length: pieces of real ones, rendered ones.
 
-    python benchmark/without_turns.py [--data DIR] [--seconds S] [--drives NAME ...] [--results]
+    python benchmark/without_turns.py [--data DIR] [--seconds S] [--drives NAME ...]
+                                      [--seeds 8000-8009] [--spoilt NAME ...] [--results]
 
-Each drive is cut into pieces of so many seconds; a piece with a turn of 20 degrees or more is left
-out. Each piece is calibrated twice, without knowing anything and with known.stabiliser=no.
---results writes the table into benchmark/results/without_turns.md.
+Real drives are cut into pieces of so many seconds; a piece with a turn of 20 degrees or more is
+left out. A seed draws a camera and a street as population.py does, and a drive of 10 to 40 s
+with bumps: straight with lane keeping, or bends of 100 to 800 m radius. Each is calibrated
+twice: without knowing anything, and with known.stabiliser=no. --spoilt: rendered drives whose
+pictures a stabiliser moved, or that were zoomed or cropped; nothing is known of them.
+Rows go to DIR/without_turns.json; what is there is not run again. --results writes the table into
+benchmark/results/without_turns.md.
 """
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
-from measure import isolated, keep_table, parser_with, table
+import numpy.typing as npt
+from attacks import Film, shifted, stepped, warped, with_pictures, zoomed
+from mapping import GRID
+from measure import calibrate as calibrate_frames
+from measure import isolated, keep_table, load, parser_with, save, table
+from population import closest_cameras, rays_of
+from population import drive_of as camera_and_street
+from scipy.ndimage import gaussian_filter1d
 
 from dashcalib_ros import Config, calibrate
+from dashcalib_ros.demo import Drive, Turn
+from dashcalib_ros.judge import CalibrationData
 
 # input, images per second of folders, and the truth of fx with its sigma, px
 DRIVES = {'kitti03': ('bag', None, 718.2, 1.8), 'kitti07': ('images', 9.65, 701.9, 1.4),
           'kitti_raw': ('images', 9.7, 981.5, 3.0)}
 # degrees
 SHARP = 20.0
+DURATION_S = (10.0, 40.0)
+LANE_DEG, LANE_RADIUS_M = (0.5, 3.0), (150.0, 400.0)
+BEND_DEG, BEND_RADIUS_M = (6.0, 30.0), (100.0, 800.0)
+
+
+def gentle_drive(seed: int) -> Drive:
+    """Return the drive of a seed: odd ones have bends, even ones only keep their lane."""
+    drawn = camera_and_street(seed)
+    rng = np.random.default_rng([seed, 59])
+    seconds, bends = rng.uniform(*DURATION_S), bool(seed % 2)
+    angles, radii = (BEND_DEG, BEND_RADIUS_M) if bends else (LANE_DEG, LANE_RADIUS_M)
+    spec = replace(drawn.spec, straight_m=float(rng.uniform(5.0, 30.0)), lead_m=10.0,
+                   stops=(), turn_speed_mps=drawn.spec.speed_mps)
+    left, turns, side = seconds * spec.speed_mps - 20.0, list[Turn](), rng.choice([-1.0, 1.0])
+    while left > 0.0:
+        turn = Turn(float(side * rng.uniform(*angles)), float(rng.uniform(*radii)))
+        turns.append(turn)
+        left -= np.radians(abs(turn.angle_deg)) * turn.radius_m + spec.straight_m
+        side = -side if not bends or rng.random() < 0.5 else side
+    return type(drawn)(drawn.lens, replace(spec, turns=tuple(turns)))
+
+
+def film_of(drive: Drive) -> Film:
+    """Return the pictures of a drive, with the true angles of its camera."""
+    ahead = drive.poses[:, :3, 2]
+    lens = drive.lens
+    return Film([drive.frame(k) for k in range(len(drive))],
+                {'fx': lens.fx, 'fy': lens.fy, 'cx': lens.cx, 'cy': lens.cy},
+                -np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0])),
+                np.arctan2(-ahead[:, 2], np.hypot(ahead[:, 0], ahead[:, 1])), ())
+
+
+def steadied(across: bool, down: bool, lag_s: float | None
+             ) -> Callable[[Film, np.random.Generator], Film]:
+    """Move the crop by at most 5 % of the width against what the camera turns.
+
+    lag_s: of a low pass; None: of a Gaussian of half a second, which knows the future.
+    """
+    def shakes(angle: npt.NDArray[np.float64], seconds: npt.NDArray[np.float64]
+               ) -> npt.NDArray[np.float64]:
+        step = float(np.median(np.diff(seconds)))
+        if lag_s is None:
+            return np.asarray(angle - gaussian_filter1d(angle, 0.5 / step, mode='nearest'))
+        keep, smooth = np.exp(-step / lag_s), angle.copy()
+        for k in range(1, len(angle)):
+            smooth[k] = keep * smooth[k - 1] + (1 - keep) * angle[k]
+        return angle - smooth
+
+    def change(film: Film, rng: np.random.Generator) -> Film:
+        height, width = film.frames[0].image.shape
+        most = 0.05 * width
+        right, below = (np.clip(-film.truth[f] * shakes(angle, film.seconds), -most, most) * on
+                        for f, angle, on in (('fx', film.yaw, across), ('fy', film.pitch, down)))
+        return with_pictures(film, (
+            warped(frame.image, np.array([[1.0, 0.0, x], [0.0, 1.0, y]]), (width, height))
+            for frame, x, y in zip(film.frames, right, below, strict=True)))
+
+    return change
+
+
+SPOILT: dict[str, Callable[[Film, np.random.Generator], Film]] = {
+    'stabilised across': steadied(True, False, None),
+    'stabilised down': steadied(False, True, None),
+    'stabilised': steadied(True, True, None),
+    'stabilised, lag 0.3 s': steadied(True, True, 0.3),
+    'zoom 3 %, slowly': zoomed(lambda seconds, count: np.linspace(1.0, 1.03, count)),
+    'zoom 3 % after half': stepped(1.03, 0.5),
+    'shifted by 2 % after half': shifted(0.02)}
+
+
+def row_of(found: CalibrationData, fx: float, fx_sigma: float) -> dict[str, Any]:
+    """Return what is kept of a result."""
+    yaws = [turn.yaw_deg for turn in found.turns if turn.yaw_deg is not None]
+    sigma = float((found.sigma or {}).get('fx', np.nan))
+    row = {'verdict': found.verdict.level, 'yaw': max(yaws, default=0.0), 'scenes': len(yaws),
+           'fx': None, 'sigma': None, 'percent': None, 'sigmas': None}
+    if found.camera is None or not np.isfinite(sigma):
+        return row
+    off = found.camera.fx - fx
+    return {**row, 'fx': found.camera.fx, 'sigma': sigma, 'percent': 100 * off / fx,
+            'sigmas': off / float(np.hypot(sigma, fx_sigma))}
 
 
 def piece(data: Path, name: str, start_s: float, seconds: float, stabiliser: str
           ) -> dict[str, Any]:
     """Calibrate one piece (in a process of its own)."""
-    place, fps, _, _ = DRIVES[name]
+    place, fps, fx, fx_sigma = DRIVES[name]
     found = calibrate(data / name / place, fps=fps, start_s=start_s, duration_s=seconds,
                       config=Config.of({'known.stabiliser': stabiliser}))
-    yaws = [turn.yaw_deg for turn in found.turns if turn.yaw_deg is not None]
-    sigma = (found.sigma or {}).get('fx', np.nan)
-    return {'verdict': found.verdict.level, 'yaw': max(yaws, default=0.0), 'scenes': len(yaws),
-            'fx': np.nan if found.camera is None else found.camera.fx, 'sigma': float(sigma)}
+    return row_of(found, fx, fx_sigma)
+
+
+def rendered(seed: int, spoilt: str, stabilisers: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Calibrate a rendered drive (in a process of its own); return a row for each stabiliser."""
+    cv2.setNumThreads(1)
+    drive, rows = gentle_drive(seed), dict[str, dict[str, Any]]()
+    film, lens = film_of(drive), drive.lens
+    if spoilt:
+        film = SPOILT[spoilt](film, np.random.default_rng(seed))
+    x, y = np.meshgrid(np.linspace(0, lens.width - 1, GRID[0]),
+                       np.linspace(0, lens.height - 1, GRID[1]))
+    pixels = np.column_stack([x.ravel(), y.ravel()])
+    cameras = closest_cameras(lens, rays_of(lens, pixels), pixels)
+    for stabiliser in stabilisers:
+        found, _ = calibrate_frames(iter(film.frames),
+                                    Config.of({'known.stabiliser': stabiliser}))
+        model = '' if found.camera is None else found.camera.model
+        rows[stabiliser] = {**row_of(found, cameras.get(model, {}).get('fx', np.nan), 0.0),
+                            'model': model, 'seconds': float(film.seconds[-1])}
+    return rows
+
+
+def honesty(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return one line about the numbers among some rows."""
+    off = np.array([row['sigmas'] for row in rows if row['sigmas'] is not None])
+    if not len(off):
+        return f'{len(rows)} drives, no number.'
+    sigma = np.median([100 * row['sigma'] / row['fx'] for row in rows if row['fx'] is not None])
+    return (f'{len(rows)} drives, {len(off)} numbers, '
+            f'{sum(row["verdict"] == "accepted" for row in rows)} accepted; '
+            f'{np.sqrt(np.mean(off**2)):.2f} sigmas RMS, {np.sum(abs(off) > 2)} beyond 2, '
+            f'{np.sum(abs(off) > 3)} beyond 3; sigma {sigma:.1f} % in the median.')
 
 
 def main() -> None:
-    """Calibrate all pieces and print the table."""
-    parser = parser_with(__doc__, 'data', 'drives', drives=DRIVES)
+    """Calibrate all and print the tables."""
+    parser = parser_with(__doc__, 'data', 'drives', 'seeds', drives=DRIVES,
+                         seeds=range(8000, 8010))
     parser.set_defaults(data=Path('data'))
     parser.add_argument('--seconds', type=float, default=10.0)
     parser.add_argument('--pieces', type=int, default=8, help='of each drive, at most')
+    parser.add_argument('--spoilt', nargs='*', choices=SPOILT, default=[], metavar='NAME',
+                        help='of ' + ', '.join(SPOILT))
     args = parser.parse_args()
-    rows, off = [], {'': list[float](), 'no': list[float]()}
+    path = args.out / 'without_turns.json'
+    rows = load(path)
+
+    def keep(key: str, row: Mapping[str, Any] | None, failure: str) -> None:
+        rows[key] = {'verdict': 'failed', 'why': failure} if row is None else row
+        save(path, rows)
+        print(key, rows[key], flush=True)
+
     for name in args.drives:
-        _, _, fx, fx_sigma = DRIVES[name]
-        for n in range(args.pieces):
-            for stabiliser in off:
-                done = isolated(piece, args.data, name, n * args.seconds, args.seconds, stabiliser)
-                # a drive may be over
-                found = done.value
-                if done.failure or found['yaw'] >= SHARP or not found['scenes']:
-                    continue
-                apart = (found['fx'] - fx) / float(np.hypot(found['sigma'], fx_sigma))
-                off[stabiliser] += [apart] if np.isfinite(apart) else []
-                rows.append([name, f'{n * args.seconds:.0f}', stabiliser or 'not known',
-                             f'{found["scenes"]}', f'{found["yaw"]:.0f}', found['verdict'],
-                             f'{found["fx"]:.1f} ± {found["sigma"]:.1f}',
-                             f'{100 * (found["fx"] / fx - 1):+.1f}', f'{apart:+.1f}'])
-                print(*rows[-1], flush=True)
-    text = table(['drive', 'from s', 'stabiliser', 'stretches', 'largest yaw °', 'verdict', 'fx',
-                  'off %', 'off in sigmas'], rows)
-    for stabiliser, errors in off.items():
-        text += (f'\n\nStabiliser {stabiliser or "not known"}: {len(errors)} numbers, '
-                 f'{np.sqrt(np.mean(np.square(errors))) if errors else np.nan:.2f} sigmas RMS, '
-                 f'{sum(abs(error) > 2 for error in errors)} beyond 2, '
-                 f'{sum(abs(error) > 3 for error in errors)} beyond 3.')
+        for start in args.seconds * np.arange(args.pieces):
+            for stabiliser in ('', 'no'):
+                key = f'{name} | {start:.0f} | {args.seconds:.0f} s | {stabiliser or "not known"}'
+                if key not in rows:
+                    done = isolated(piece, args.data, name, float(start), args.seconds, stabiliser)
+                    keep(key, done.value, done.failure)
+    for seed in args.seeds:
+        for spoilt in ('', *args.spoilt):
+            stabilisers = ('',) if spoilt else ('', 'no')
+            keys = [f'{seed} | {spoilt or "as it is"} | rendered | {stabiliser or "not known"}'
+                    for stabiliser in stabilisers]
+            if not all(key in rows for key in keys):
+                done = isolated(rendered, seed, spoilt, stabilisers)
+                for key, stabiliser in zip(keys, stabilisers, strict=True):
+                    keep(key, (done.value or {}).get(stabiliser), done.failure)
+    # a piece may be beyond the end of its drive, or have a turn
+    kept = {key: row for key, row in rows.items() if row['verdict'] != 'failed' and row['scenes']
+            and (row['yaw'] < SHARP or not key.startswith(tuple(DRIVES)))}
+    text = table(
+        ['drive', 'from s; or what was done', 'length', 'stabiliser', 'verdict', 'stretches',
+         'largest yaw °', 'fx', 'off %', 'off in sigmas'],
+        [[*key.replace('rendered', f'{row.get("seconds", 0):.0f} s').split(' | '), row['verdict'],
+          f'{row["scenes"]}', f'{row["yaw"]:.0f}',
+          *(['none', '', ''] if row['fx'] is None else
+            [f'{row["fx"]:.1f} ± {row["sigma"]:.1f}', f'{row["percent"]:+.1f}',
+             f'{row["sigmas"]:+.1f}'])] for key, row in kept.items()])
+    for words, belongs in (
+            ('Real pieces', lambda key: key.startswith(tuple(DRIVES))),
+            ('Rendered', lambda key: 'as it is' in key),
+            ('Spoilt', lambda key: 'rendered' in key and 'as it is' not in key)):
+        for known in ('not known', 'no'):
+            chosen = [row for key, row in kept.items()
+                      if belongs(key) and key.endswith(f'| {known}')]
+            if chosen:
+                text += f'\n\n{words}, stabiliser {known}: {honesty(chosen)}'
     keep_table('without_turns', text, args)
 
 
