@@ -291,13 +291,16 @@ def _warnings(found: CalibrationData, solution: Solution) -> tuple[Notice, ...]:
             f'the turns do not decide whether pixels are square: that fy / fx is '
             f'{solution.camera.fy / solution.camera.fx:.3f} is wrong with a probability of '
             f'{100 * share:.0f} %, and sigma of fy contains it'))
-    if found.drift is not None and 'E-FOCAL-LENGTH-DRIFTS' not in found.verdict.codes:
+    said = {'E-FOCAL-LENGTH-DRIFTS', 'E-FOCAL-LENGTH-STEPS'}.intersection(found.verdict.codes)
+    if level != 'refused' and solution.drift is not None and not said:
         drift = found.drift
+        how = (f'{100 * solution.drift.largest:.2f} % during the drive' if drift is None else
+               f'{drift.from_first_to_last_percent:+.2f} % from the first turn to the last '
+               f'({drift.fx_percent_per_hour:+.1f} ± {drift.sigma:.1f} % an hour), as of a lens '
+               f'that warms up')
         warnings.append(Notice(
-            'E-FOCAL-LENGTH-DRIFT',
-            f'the focal length changes by {drift.from_first_to_last_percent:+.2f} % from the '
-            f'first turn to the last ({drift.fx_percent_per_hour:+.1f} ± {drift.sigma:.1f} % an '
-            f'hour), as of a lens that warms up: camera_info is that of the middle of the drive'))
+            'E-FOCAL-LENGTH-DRIFT', f'the focal length changes by {how}: camera_info is that of '
+            f'the middle of the drive; `dashcalib export --at` writes that of another time'))
     if found.mount is not None and found.mount.moved_s is not None:
         warnings.append(Notice(
             'E-CAMERA-MOVED',

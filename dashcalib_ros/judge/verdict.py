@@ -396,10 +396,10 @@ def _drifts(grounds: Grounds) -> Finding | None:
     drift, most = grounds.solution.drift, 2 * grounds.config.max_sigma
     if drift is None:
         return None
-    step_ns, percent = drift.step_ns, 100 * drift.size
+    step_ns, largest = drift.step_ns, drift.largest
     if step_ns is None:
-        found = Finding('E-FOCAL-LENGTH-DRIFTS', _graded(False, abs(drift.size) > most),
-                        f'the focal length changes by {percent:+.1f} % during the drive',
+        found = Finding('E-FOCAL-LENGTH-DRIFTS', _graded(False, largest > most),
+                        f'the focal length changes by {100 * largest:.1f} % during the drive',
                         'use intrinsics_at of result.json: `dashcalib export --at`; or fix the '
                         'zoom and the focus')
     else:
@@ -408,13 +408,13 @@ def _drifts(grounds: Grounds) -> Finding | None:
                      in grounds.solution.scenes if scene.turn.of_this_drive)
         before, after = ([turn for stamp_ns, turn in own if (stamp_ns >= step_ns) == later]
                          for later in (False, True))
-        found = Finding('E-FOCAL-LENGTH-STEPS', _graded(False, abs(drift.size) > most),
-                        f'the focal length steps by {percent:+.1f} % between '
+        found = Finding('E-FOCAL-LENGTH-STEPS', _graded(False, largest > most),
+                        f'the focal length steps by {100 * drift.size:+.1f} % between '
                         f'{_turns(before[-1:])} and {_turns(after[:1])}, as if somebody had '
                         f'touched the lens',
                         'use the two calibrations in parts of result.json: `dashcalib export '
                         '--at`')
-    return found.measured('change of the focal length during the drive', f'{abs(percent):.2f} %',
+    return found.measured('change of the focal length during the drive', f'{100 * largest:.2f} %',
                           f'at most {100 * most:.3g} %')
 
 

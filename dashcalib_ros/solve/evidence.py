@@ -318,8 +318,8 @@ def shift_size(found: Estimate) -> float:
 def drifting(found: Estimate) -> Drift | None:
     """Return how the focal length changes, as the evidence favours it; None for a steady one.
 
-    It grows steadily, or steps between two turns, or does all of that, as a zoom. Two turns cannot
-    tell the one from the other.
+    It grows steadily, or steps between two turns; or it does all of that, as a zoom, and where the
+    turns do not tell which. Two turns cannot.
     """
     turns = sorted((int(stamps.min()), int(stamps.max())) for stamps in (
         scene.tracks.stamps_ns for scene in found.scenes if scene.turn.of_this_drive))
@@ -346,15 +346,18 @@ def drifting(found: Estimate) -> Drift | None:
         return max(nats) - none, sized[1 + int(np.argmax(nats))]
 
     one = replace(asked, value=np.zeros(1))
-    best = likeliest_of(replace(one, steps_ns=()), own[:1])
+    alone = [likeliest_of(replace(one, steps_ns=()), own[:1])]
     for place, step_ns in zip(own[1:], steps, strict=True):
         nats, step = likeliest_of(replace(one, steady=False, steps_ns=(step_ns,)), place)
         # any of the steps is as likely as a steady growth
-        best = max(best, (nats - float(np.log(len(steps))), step), key=itemgetter(0))
-    if best[0] <= DRIFT_NATS:
+        alone.append((nats - float(np.log(len(steps))), step))
+    (best, way), *others = sorted(alone, key=itemgetter(0), reverse=True)
+    if best <= DRIFT_NATS:
         return None
-    every = likeliest_of(asked, own)
-    return (every if every[0] > best[0] + DRIFT_NATS else best)[1]
+    # where another way may be right, too, the sigma of all of them contains it
+    every, ways = likeliest_of(asked, own)
+    rival = max((nats for nats, _ in others), default=-np.inf)
+    return ways if every > best + DRIFT_NATS or rival > best - DRIFT_NATS else way
 
 
 def moves(tests: Sequence[FixedCameraTest]) -> bool:

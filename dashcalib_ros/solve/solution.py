@@ -47,6 +47,14 @@ class FocalDrift:
         return self.of(replace(self.ways, value=value + step[-len(value):]), covariance)
 
     @property
+    def largest(self) -> float:
+        """Return by how much it differs at the most between two times of the drive, of 1."""
+        steps_ns = np.array(self.ways.steps_ns, np.int64)
+        grown = self.ways.grown_at(np.r_[
+            self.ways.begin_ns, steps_ns - 1, steps_ns, self.ways.end_ns])
+        return float(np.ptp(grown @ self.ways.value))
+
+    @property
     def seconds(self) -> float:
         """Return the time from the first turn's begin to the last one's end."""
         return (self.ways.end_ns - self.ways.begin_ns) / 1e9

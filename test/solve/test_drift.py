@@ -11,8 +11,9 @@ from solving import CONFIG, scenes_of, solved
 from synthetic import LENS, SIZE
 
 from dashcalib_ros.judge.verdict import judge
+from dashcalib_ros.problem.blocks import Drift
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.solve.solution import with_measurement
+from dashcalib_ros.solve.solution import FocalDrift, with_measurement
 
 pytestmark = pytest.mark.usefixtures('no_profile')
 
@@ -80,6 +81,22 @@ def test_a_step_is_found_at_its_place_with_a_calibration_of_each_side():
         camera, sigma = solution.at(turn * 60 * 10**9)
         assert abs(camera.fx - zoom * LENS.fx) < 3 * sigma[0] < 0.01 * LENS.fx
     assert 'E-FOCAL-LENGTH-STEPS' in judge(solution, CONFIG.verdict).codes
+
+
+def test_it_is_not_said_how_it_changes_where_turns_do_not_tell():
+    zooms = [1.0, 1.0, 1.015]
+    solution = solved(zoomed(zooms))
+    assert solution.drift is not None and solution.parts == ()
+    assert not solution.drift.linear and solution.drift.step_ns is None
+    for turn, zoom in enumerate(zooms):
+        camera, sigma = solution.at(turn * 60 * 10**9 + 10**9)
+        assert abs(camera.fx - zoom * LENS.fx) < 3 * sigma[0]
+
+
+def test_a_zoom_in_and_back_changes_as_much_as_in_between():
+    ways = Drift(np.array([0.0, 0.3, -0.3]), 0, 100, steps_ns=(30, 60))
+    found = FocalDrift.of(ways, np.eye(9))
+    assert found.size == pytest.approx(0.0) and found.largest == pytest.approx(0.3)
 
 
 def test_nothing_steps_between_turns_that_overlap():
