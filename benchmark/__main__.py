@@ -65,6 +65,8 @@ PARTS = (
     Part('curves', 45, 'error over the number of turns and over the frame rate'),
     Part('ego_mask', 30, 'what the mask of the ego vehicle is worth'),
     Part('motion', 40, 'a gyro and GPS'),
+    Part('clocks', 10, 'clocks of sensors and of poses, shifted'),
+    Part('drift', 20, 'a focal length that grows, steps or zooms'),
     Part('dark', 15, 'turns in dark and wet pictures'),
     Part('mount', 60, 'how the camera sits on the car'),
     Part('moved', 5, 'a camera that is moved within a drive'),

@@ -124,7 +124,7 @@ def row(drive: Driven, stream: SensorStream, sensor: str = 'gyro',
     informed = found.solution or drive.solution
     verdict = judge(informed, Config().verdict, witnesses=found.witnesses).level
     for kind, said in (('gyro', found.witnesses.gyro), ('GPS', found.witnesses.gps)):
-        if said is None:
+        if said is None or said.fx_percent is None:
             continue
         own = 100 * (drive.solution.camera.fx / drive.truth - 1)
         time = ('' if said.time_offset_s is None or said.time_sigma_s is None else
@@ -148,7 +148,7 @@ def harm(drive: Driven, stream: SensorStream) -> list[str]:
         each for each in scenes if each is not None))
     said = [found.witnesses.gyro for found in (
         asked(drive, scaled(stream, 1.03)), asked(drive, scaled(stream, 1.0), longer))]
-    told = ['' if each is None else
+    told = ['' if each is None or each.fx_percent is None or each.fx_sigma_percent is None else
             f'{abs(each.fx_percent) / each.fx_sigma_percent:.1f} sigma'
             f'{"" if each.agrees else ", contradiction"}' for each in said]
     by_gps = []
@@ -157,7 +157,8 @@ def harm(drive: Driven, stream: SensorStream) -> list[str]:
             asked(drive, SensorStream(position=fixes(drive.poses, 1.0, 3.0, jumps, seed)))
             for seed in range(TRACKS)]
         assert all(each.solution is solution for each in found)
-        agree = [each.witnesses.gps.agrees for each in found if each.witnesses.gps is not None]
+        agree = [each.witnesses.gps.agrees for each in found if each.witnesses.gps is not None
+                 and each.witnesses.gps.fx_percent is not None]
         by_gps.append(f'{len(agree)}, {agree.count(False)}')
     return [drive.name, f'{moved:.2f}', *told, *by_gps]
 
@@ -272,13 +273,20 @@ def real(data: Path) -> Iterator[tuple[Driven, SensorStream]]:
     yield Driven('kitti03', *solved(open_frames(data / 'kitti03' / 'bag')), 718.2, made), gyro(
         made, 1)
     folder = data / 'kitti07'
-    when = columns_of(folder / 'odom.csv')['stamp_s']
+    own = columns_of(folder / 'odom.csv')
+    when, own_m = own['stamp_s'], np.stack([own[name] for name in ('z_m', 'x_m', 'y_m')], axis=1)
     made = poses_of(when, np.loadtxt(folder / 'poses.txt').reshape(-1, 3, 4))
-    yield Driven('kitti07', *solved(pictures(folder, when)), 701.9, made), gyro(made, 1)
+    rates = np.stack([own[f'{name}_rad_s'] for name in ('wx', 'wy', 'wz')], axis=1)
+    drive = Driven('kitti07', *solved(pictures(folder, when)), 701.9, made)
+    yield drive, gyro(made, 1)
+    yield dataclasses.replace(drive, name='kitti07, odometry', poses=None), SensorStream(
+        rate=Samples(when, rates), speed=Samples(when, own['speed_m_s'][:, None]),
+        position=Samples(when, own_m * [1.0, -1.0, -1.0]))
     folder = data / 'kitti_raw'
     when, own = columns_of(folder / 'images.csv')['stamp_s'], columns_of(folder / 'oxts.csv')
     yield Driven('kitti_raw', *solved(pictures(folder, when)), 984.2439), SensorStream(
         rate=Samples(own['stamp_s'], np.stack([own[name] for name in ('wx', 'wy', 'wz')], axis=1)),
+        speed=Samples(own['stamp_s'], own['vf'][:, None]),
         position=Samples(own['stamp_s'], local_metres(own['lat'], own['lon'], own['alt'])))
 
 

@@ -32,7 +32,7 @@ from dashcalib_ros.judge.conclude import (
     turns_that_stood,
 )
 from dashcalib_ros.judge.monitor import readings_of
-from dashcalib_ros.judge.witnesses import SensorComparison, compare_sensors
+from dashcalib_ros.judge.witnesses import SensorComparison, clock_of_poses, compare_sensors
 from dashcalib_ros.reconstruct.repeated import without_repeated
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.report import Calibration
@@ -312,7 +312,11 @@ class Calibrator:
                    'guess': judge.trivial_guess(own.image_size)}
         found: Odometry = self.workers.run(judge.odometry, self.solution.scenes, cameras, poses,
                                            self.scenes.config)
-        return found
+        # a track has the headings of its way, which are not the car's
+        clock = None if poses.of_track else spared(
+            'the clock of the poses', [], self.workers.run, clock_of_poses, self.solution, poses,
+            self.scenes.config)
+        return replace(found, clock=clock)
 
     def watch(self, camera: Camera, sigma: Mapping[str, float] | None = None) -> Monitor:
         """Return whether the turns so far show that a camera in use has changed.

@@ -393,6 +393,12 @@ COMMANDS = {
                                 'does not say the size of its pictures, that size'}),
             ('--crop', {'type': whole_numbers(',', 4, '0,100,1280,520'), 'metavar': 'X,Y,W,H',
                         'help': 'for this part of the pictures'}),
+            ('--at', {'type': number('0 or more seconds, such as 12.5s or 1:30',
+                                     lambda value: value >= 0,
+                                     lambda text: _seconds(text.removesuffix('s'))),
+                      'metavar': 'S',
+                      'help': 'of a result.json whose camera changes during the drive: the one '
+                              'S seconds after the first image'}),
             ('--nearest', {**FLAG, 'help': 'of a lens that ROS has no model for (omni, double '
                                            'sphere, EUCM, FOV, division ...), write the nearest '
                                            'one, and say by how many px it is off'}),

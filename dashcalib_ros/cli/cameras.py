@@ -63,6 +63,9 @@ def export(args: argparse.Namespace) -> int:
     """Write the camera to --out, or to standard output."""
     found = load_camera(args.calibration, image_size=args.size, nearest=args.nearest)
     warn(found.warnings)
+    if args.at is not None:
+        camera, sigma = load_calibration(args.calibration).at(args.at)
+        found = replace(found, camera=camera, sigma=sigma, covariance=None)
     camera, readout_ms = found.camera, found.readout_ms
     if args.size not in (None, camera.image_size):
         camera = resized(camera, args.size)

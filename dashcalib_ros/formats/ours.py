@@ -39,11 +39,13 @@ from dashcalib_ros.formats.values import (
 from dashcalib_ros.judge import CalibrationData, TurnSummary, Verdict
 from dashcalib_ros.judge.calibration import (
     ANGLES,
+    CameraAt,
     Condition,
     Drift,
     Known,
     LensField,
     Mount,
+    Part,
     Shutter,
     Stabiliser,
     StoredTurnSummary,
@@ -92,6 +94,8 @@ def result_dict(calibration: CalibrationData) -> dict[str, Any]:
         'witnesses': c.witnesses,
         'known': c.known,
         'drift': c.drift,
+        'intrinsics_at': c.intrinsics_at,
+        'parts': c.parts,
         'input': c.input_name,
         'part': c.part,
         'warnings': c.warnings,
@@ -182,7 +186,10 @@ def calibration_of(data: Data, camera: Camera | None) -> CalibrationData:
         witnesses=Witnesses(**{name: made(Witness, each) for name, each
                                in (data.get('witnesses') or {}).items()}),
         known=tuple(made(Known, each) for each in data.get('known', ())),
-        drift=made(Drift, data.get('drift')))
+        drift=made(Drift, data.get('drift')),
+        intrinsics_at=tuple(made(CameraAt, each) for each in data.get('intrinsics_at', ())),
+        parts=tuple(made(Part, {**each, 'sigma_px': made(PictureSigma, each['sigma_px'])})
+                    for each in data.get('parts', ())))
 
 
 def _frozen(value: Any) -> Any:

@@ -48,6 +48,11 @@ class Poses:
     warnings: tuple[Notice, ...] = ()
     longest_gap_s: float = LONGEST_GAP_S
 
+    @property
+    def of_track(self) -> bool:
+        """Return whether the headings are those of a GPS track's way."""
+        return self.longest_gap_s == TRACK_GAP_S
+
     def at(self, frames: Ints, stamps_ns: Ints) -> tuple[Floats, Floats, Mask]:
         """Return rotations (k, 3, 3), positions (k, 3) and which of them are known (k,).
 

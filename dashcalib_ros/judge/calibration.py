@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from dataclasses import field as default
 from typing import Any, Literal
 
@@ -145,36 +145,56 @@ class Stabiliser:
 
 @dataclass(frozen=True)
 class Witness:
-    """The focal length by a sensor, from the angles of the turns.
+    """What a sensor knows: its clock, and the focal length, from the angles of the turns.
 
     time_offset_s: to subtract from the sensor's stamps; positive: its messages are late.
-    None where it is not known. scale: the sensor's angles over the camera's. fx_percent: by how
-    much fx would have to change to agree with the sensor, of fx; fx_sigma_percent: with what the
-    sensor's own scale may be off. agrees: no contradiction beyond 3 sigmas of both.
-    camera_from_sensor: (3, 3) row by row, from the sensor's axes to the camera's; bias_rad_s: (3,)
-    of the sensor's rates; both None where a sensor has none. scale_by_gps: a gyro's angles over
-    those of GPS headings, and the sigma: taken out of scale; None where they say nothing.
+    drift_ppm: by how much it grows, us in a second. Each is None where it is not known; so is what
+    follows, of a sensor that does not measure angles, or not well enough. scale: the sensor's
+    angles over the camera's. fx_percent: by how much fx would have to change to agree with the
+    sensor, of fx; fx_sigma_percent: with what the sensor's own scale may be off. agrees: no
+    contradiction beyond 3 sigmas of both. camera_from_sensor: (3, 3) row by row, from the sensor's
+    axes to the camera's; bias_rad_s: (3,) of the sensor's rates; both None where a sensor has
+    none. scale_by_gps: a gyro's angles over those of GPS headings, and the sigma: taken out of
+    scale; None where they say nothing.
     """
 
     time_offset_s: float | None
     time_sigma_s: float | None
-    scale: float
-    scale_sigma: float
-    fx_percent: float
-    fx_sigma_percent: float
-    agrees: bool
+    scale: float | None = None
+    scale_sigma: float | None = None
+    fx_percent: float | None = None
+    fx_sigma_percent: float | None = None
+    agrees: bool = True
     camera_from_sensor: tuple[tuple[float, ...], ...] | None = None
     alignment_sigma_deg: float | None = None
     bias_rad_s: tuple[float, ...] | None = None
     scale_by_gps: tuple[float, ...] | None = None
+    drift_ppm: float | None = None
+    drift_sigma_ppm: float | None = None
+
+    @property
+    def clock(self) -> dict[str, Any]:
+        """Return what is known of the clock, by the names in result.json."""
+        return {name: getattr(self, name) for name in (
+            'time_offset_s', 'time_sigma_s', 'drift_ppm', 'drift_sigma_ppm')}
+
+    def timed(self, other: Witness) -> Witness:
+        """Return it with the clock of another."""
+        return replace(self, **other.clock)
+
+    def later(self, late_s: float) -> Witness:
+        """Return it where that much was taken off the stamps before."""
+        return self if self.time_offset_s is None else replace(
+            self, time_offset_s=self.time_offset_s + late_s)
 
 
 @dataclass(frozen=True)
 class Witnesses:
-    """The sensors that were compared; each None where it is not used."""
+    """The sensors that were compared; each None where it is not used. odometry: of speeds."""
 
     gyro: Witness | None = None
     gps: Witness | None = None
+    odometry: Witness | None = None
 
 
 @dataclass(frozen=True)
@@ -312,6 +332,36 @@ class Drift:
 
 
 @dataclass(frozen=True)
+class CameraAt:
+    """The camera at a time of the drive, where it changes. time_s: since the first image.
+
+    sigma: by the names of intrinsics.
+    """
+
+    time_s: float
+    intrinsics: Mapping[str, float] = default(hash=False)
+    sigma: Mapping[str, float] = default(hash=False)
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of a drive with a camera of its own, where that steps: see CalibrationData.
+
+    from_s, to_s: since the first image, the turns that it is from.
+    """
+
+    from_s: float
+    to_s: float
+    verdict: Level
+    reasons: tuple[str, ...]
+    reason_codes: tuple[str, ...]
+    camera_model: str | None
+    intrinsics: Mapping[str, float] | None = default(hash=False)
+    sigma: Mapping[str, float] | None = default(hash=False)
+    sigma_px: PictureSigma | None = None
+
+
+@dataclass(frozen=True)
 class Known:
     """What somebody knew of the camera: fx in px, hfov in degrees, aspect, shutter in s.
 
@@ -350,6 +400,8 @@ class CalibrationData:
     straight_lines: the distortion by upright lines of the world; None: too few of them.
     witnesses: the focal length by the car's own sensors. known: what somebody knew before.
     drift: of the focal length; camera is that of the middle of the drive then. None: it is steady.
+    intrinsics_at: the camera over the time, where it drifts, zooms or steps. parts: before and
+    after a step.
     part: (x, y, width, height) of the pictures, px, that camera and all else are of; None: all.
     start_s: stamp of the first image. material: what the report draws, None in a live drive.
     """
@@ -381,6 +433,8 @@ class CalibrationData:
     witnesses: Witnesses = default(default_factory=Witnesses)
     known: tuple[Known, ...] = ()
     drift: Drift | None = None
+    intrinsics_at: tuple[CameraAt, ...] = ()
+    parts: tuple[Part, ...] = ()
     start_s: float = 0.0
     material: Material | None = default(default=None, compare=False)
     covariance: Floats | None = default(default=None, compare=False)
@@ -404,6 +458,27 @@ class CalibrationData:
         lone = (self.camera is not None and self.turns_used == 1
                 and not (self.verdict.level == 'accepted' and 'pictures_alone' in self.details))
         return 'from one turn alone, which nothing confirms' if lone else ''
+
+    def at(self, time_s: float) -> tuple[Camera, Mapping[str, float] | None]:
+        """Return the camera at a time, s since the first image, and its sigma.
+
+        Between two times of intrinsics_at on a straight line, but not across a step; before the
+        first and after the last one as there. Raises InputError where there is no camera.
+        """
+        camera, rows = self._camera, self.intrinsics_at
+        if not rows:
+            return camera, self.sigma
+        if self.parts:
+            middle_s = (self.parts[0].to_s + self.parts[1].from_s) / 2
+            rows = tuple(row for row in rows
+                         if (row.time_s > middle_s) == (time_s > middle_s)) or rows
+        when = [row.time_s for row in rows]
+
+        def values(name: str) -> dict[str, float]:
+            return {key: float(np.interp(time_s, when, [
+                getattr(row, name)[key] for row in rows])) for key in camera.named}
+
+        return camera.with_params(list(values('intrinsics').values())), values('sigma')
 
     @property
     def K(self) -> Floats:  # noqa: N802, the field's name for it

@@ -25,11 +25,13 @@ from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge.agreement import CONTRADICTS, focal_disagreement
 from dashcalib_ros.judge.calibration import (
     CalibrationData,
+    CameraAt,
     Drift,
     Known,
     LensField,
     Material,
     Mount,
+    Part,
     Shutter,
     Stabiliser,
     StoredTurnSummary,
@@ -161,6 +163,10 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
                     stabiliser=None if crop_px is None else Stabiliser(largest_px=crop_px))
     if found.verdict.level != 'refused':
         found = _with_numbers(found, solution, lines, evidence, lost)
+    if solution.parts:
+        found = replace(found, parts=tuple(
+            _part(part, solution, later, evidence, config)
+            for later, part in enumerate(solution.parts)))
     return replace(found, warnings=(*found.warnings, *_warnings(found, solution), *lost))
 
 
@@ -198,19 +204,60 @@ def _with_numbers(found: CalibrationData, solution: Solution, lines: Bend | None
         straight_lines=lines and lines.resized(px), field=_field(solution, evidence.image_size),
         mount=spared('the mounting', lost, _mount, solution, evidence, found.verdict.level,
                      found.config),
-        drift=_drift(solution),
+        drift=_drift(solution), intrinsics_at=_over_time(solution, evidence),
         rolling_shutter=Shutter(1e3 * solution.readout_s, 1e3 * solution.readout_sigma_s)
         if solution.rolling else None)
 
 
 # of pixels that are not square, or are so where they seem not to be: a warning says it
 REPORTED_SHARE = 0.05
+
+
 def _drift(solution: Solution) -> Drift | None:
     found = solution.drift
-    if found is None:
+    if found is None or not found.linear:
         return None
     per_hour = 100 * 3600 / found.seconds
     return Drift(per_hour * found.size, per_hour * found.sigma, 100 * found.size)
+
+
+def _over_time(solution: Solution, evidence: Evidence) -> tuple[CameraAt, ...]:
+    """Return the camera at the begin, in the middle and at the end of each turn, if it changes."""
+    drift, rows = solution.drift, []
+    if drift is None:
+        return ()
+    stamps = [scene.tracks.stamps_ns for scene in solution.scenes if scene.turn.of_this_drive]
+    for stamp_ns in sorted({int(each) for own in stamps for each in (
+            own[0], (own[0] + own[-1]) // 2, own[-1])}):
+        camera, sigma = solution.at(stamp_ns)
+        full, units = camera.resized(solution.px, evidence.image_size), camera.units(solution.px)
+        rows.append(CameraAt(stamp_ns / 1e9 - evidence.start_s, full.named,
+                             dict(zip(full.names(), (sigma * units).tolist(), strict=True))))
+    return tuple(rows)
+
+
+def _part(part: Solution | None, whole: Solution, later: int, evidence: Evidence, config: Config
+          ) -> Part:
+    """Return what the turns before a step say, or those later, each with its own verdict."""
+    assert whole.drift is not None
+    step_ns = whole.drift.step_ns or 0
+    stamps = [scene.tracks.stamps_ns for scene in whole.scenes if scene.turn.of_this_drive
+              and (int(scene.tracks.stamps_ns[0]) >= step_ns) == bool(later)]
+    from_s, to_s = (float(pick(each)) / 1e9 - evidence.start_s for pick, each in (
+        (min, map(min, stamps)), (max, map(max, stamps))))
+    if part is None:
+        verdict = Verdict('refused', ('no camera follows from its turns',),
+                          codes=('E-UNDETERMINED',))
+    else:
+        part = replace(part, px=whole.px)
+        verdict = judge(part, config.verdict)
+    if part is None or verdict.level == 'refused':
+        return Part(from_s, to_s, verdict.level, verdict.reasons, verdict.codes, None, None, None)
+    full = part.camera.resized(part.px, evidence.image_size)
+    sigma = (part.sigma * part.camera.units(part.px)).tolist()
+    return Part(from_s, to_s, verdict.level, verdict.reasons, verdict.codes, full.model,
+                full.named, dict(zip(full.names(), sigma, strict=True)),
+                part.picture.times(part.px))
 
 
 # px RMS; a warning names a field that no lens model has, if it is larger
@@ -244,13 +291,16 @@ def _warnings(found: CalibrationData, solution: Solution) -> tuple[Notice, ...]:
             f'the turns do not decide whether pixels are square: that fy / fx is '
             f'{solution.camera.fy / solution.camera.fx:.3f} is wrong with a probability of '
             f'{100 * share:.0f} %, and sigma of fy contains it'))
-    if found.drift is not None and 'E-FOCAL-LENGTH-DRIFTS' not in found.verdict.codes:
+    said = {'E-FOCAL-LENGTH-DRIFTS', 'E-FOCAL-LENGTH-STEPS'}.intersection(found.verdict.codes)
+    if level != 'refused' and solution.drift is not None and not said:
         drift = found.drift
+        how = (f'{100 * solution.drift.largest:.2f} % during the drive' if drift is None else
+               f'{drift.from_first_to_last_percent:+.2f} % from the first turn to the last '
+               f'({drift.fx_percent_per_hour:+.1f} ± {drift.sigma:.1f} % an hour), as of a lens '
+               f'that warms up')
         warnings.append(Notice(
-            'E-FOCAL-LENGTH-DRIFT',
-            f'the focal length changes by {drift.from_first_to_last_percent:+.2f} % from the '
-            f'first turn to the last ({drift.fx_percent_per_hour:+.1f} ± {drift.sigma:.1f} % an '
-            f'hour), as of a lens that warms up: camera_info is that of the middle of the drive'))
+            'E-FOCAL-LENGTH-DRIFT', f'the focal length changes by {how}: camera_info is that of '
+            f'the middle of the drive; `dashcalib export --at` writes that of another time'))
     if found.mount is not None and found.mount.moved_s is not None:
         warnings.append(Notice(
             'E-CAMERA-MOVED',

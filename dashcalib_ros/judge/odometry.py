@@ -19,6 +19,7 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input.poses import Poses
+from dashcalib_ros.judge.calibration import Witness
 from dashcalib_ros.reconstruct.scene import Scene
 
 # keyframes with poses; a turn with fewer says nothing
@@ -71,10 +72,11 @@ class TurnOdometry:
 
 @dataclass(frozen=True)
 class Odometry:
-    """All turns that have poses. names: of the cameras."""
+    """All turns that have poses. names: of the cameras. clock: of the poses; None: not known."""
 
     names: tuple[str, ...]
     turns: tuple[TurnOdometry, ...]
+    clock: Witness | None = None
 
     def medians(self) -> dict[str, dict[str, float]]:
         """Return the medians over the turns, by what is measured and by the camera's name."""

@@ -383,16 +383,35 @@ def _not_fixed(grounds: Grounds) -> Finding | None:
                    'fix the zoom and the focus, then record another drive')
 
 
+# of the focal length; a smaller step is no reason for a verdict
+LEAST_STEP = 0.003
+
+
 def _drifts(grounds: Grounds) -> Finding | None:
     """No camera_info is right for a focal length that changes by more than fx may be off."""
     drift, most = grounds.solution.drift, 2 * grounds.config.max_sigma
     if drift is None:
         return None
-    return Finding('E-FOCAL-LENGTH-DRIFTS', _graded(False, abs(drift.size) > most),
-                   f'the focal length changes by {100 * drift.size:+.1f} % during the drive',
-                   'calibrate parts of the drive separately: --start and --end').measured(
-        'change of the focal length during the drive', f'{100 * abs(drift.size):.2f} %',
-        f'at most {100 * most:.3g} %')
+    step_ns, largest = drift.step_ns, drift.largest
+    if step_ns is None:
+        found = Finding('E-FOCAL-LENGTH-DRIFTS', _graded(False, largest > most),
+                        f'the focal length changes by {100 * largest:.1f} % during the drive',
+                        'use intrinsics_at of result.json: `dashcalib export --at`; or fix the '
+                        'zoom and the focus')
+    else:
+        most = LEAST_STEP
+        own = sorted((int(scene.tracks.stamps_ns[0]), scene.turn) for scene
+                     in grounds.solution.scenes if scene.turn.of_this_drive)
+        before, after = ([turn for stamp_ns, turn in own if (stamp_ns >= step_ns) == later]
+                         for later in (False, True))
+        found = Finding('E-FOCAL-LENGTH-STEPS', _graded(False, largest > most),
+                        f'the focal length steps by {100 * drift.size:+.1f} % between '
+                        f'{_turns(before[-1:])} and {_turns(after[:1])}, as if somebody had '
+                        f'touched the lens',
+                        'use the two calibrations in parts of result.json: `dashcalib export '
+                        '--at`')
+    return found.measured('change of the focal length during the drive', f'{100 * largest:.2f} %',
+                          f'at most {100 * most:.3g} %')
 
 
 def _moving(how: str, px: float, solution: Solution) -> Finding:

@@ -28,7 +28,18 @@ from dashcalib_ros.arrays import Floats
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import Notice, one_line
 from dashcalib_ros.input.motion import Samples, SensorStream, zone_text
+from dashcalib_ros.input.poses import Poses
 from dashcalib_ros.judge.calibration import Witness, Witnesses
+from dashcalib_ros.judge.clocks import (
+    LARGEST_OFFSET_S,
+    MADE_S,
+    PACE,
+    Path,
+    clock,
+    of_steps,
+    offset_of,
+    paths_of,
+)
 from dashcalib_ros.judge.gyro_scale import (
     FIXES,
     HEADING_SIGMA_DEG,
@@ -84,7 +95,8 @@ def compare_sensors(solution: Solution | None, stream: SensorStream | None, star
             'E-SENSOR-NO-TURNS', f'the {name} is not used: no turn could be reconstructed that it '
             f'could be compared with') for name in unused)))
     scenes = [scene for scene in solution.scenes if scene.turn.of_this_drive]
-    gyro = gps = informed = None
+    gyro = gps = odometry = informed = None
+    late_s = 0.0
     notices: list[Notice | None] = list(stream.warnings)
     try:
         loss_px = loss_px_of(solution.scenes, solution.camera, config.intrinsics)
@@ -93,7 +105,7 @@ def compare_sensors(solution: Solution | None, stream: SensorStream | None, star
                  and (steps := steps_of(scene, solution, loss_px, start_s)) is not None]
         apart = {kind: words for kind, samples in stream.kinds.items()
                  if (words := _apart(samples, turns))}
-        late_s, own, doubt_s = 0.0, None, stream.doubt_s
+        own, doubt_s = None, stream.doubt_s
         if stream.rate is not None and doubt_s and turns:
             late_s = _late_s(turns, stream.rate, doubt_s)
             stream = stream.shifted(-late_s)
@@ -104,7 +116,6 @@ def compare_sensors(solution: Solution | None, stream: SensorStream | None, star
             gyro, notice = _gyro(fit, solution, own, apart.get('rate', ''))
             if gyro is not None:
                 doubt_s = 0.0
-                gyro = replace(gyro, time_offset_s=(gyro.time_offset_s or 0.0) + late_s)
             notices += [own.contradiction, notice]
             if fit is not None and gyro is not None and gyro.agrees:
                 informed, notice = _informed(solution, fit, own, config)
@@ -114,6 +125,11 @@ def compare_sensors(solution: Solution | None, stream: SensorStream | None, star
                                doubt_s)
             # it has its use where it tells the gyro's scale
             notices.append(None if own is not None and own.by_gps else notice)
+        if turns and not doubt_s:
+            paths = paths_of(scenes, start_s)
+            odometry = _clock_of(stream.speed, stream, gyro, paths)
+            by_fixes = _clock_of(stream.position, stream, gyro, paths)
+            gps = gps.timed(by_fixes) if gps and by_fixes else gps or by_fixes
         if 'speed' in apart:
             notices.append(Notice('E-SPEED-NO-SAMPLES', f'the speed is not used: it has no '
                                   f'samples during the turns, {apart["speed"]}'))
@@ -122,7 +138,23 @@ def compare_sensors(solution: Solution | None, stream: SensorStream | None, star
             'E-SENSORS-NOT-COMPARED',
             f'the motion sensors could not be compared with the turns ({one_line(error)})'))
     kept = solution if informed is None or (gps is not None and not gps.agrees) else informed
-    return SensorComparison(kept, Witnesses(gyro, gps), tuple(filter(None, notices)))
+    return SensorComparison(kept, Witnesses(*(
+        each and each.later(late_s) for each in (gyro, gps, odometry))),
+        tuple(filter(None, notices)))
+
+
+def _clock_of(samples: Samples | None, stream: SensorStream, gyro: Witness | None,
+              paths: Sequence[Path]) -> Witness | None:
+    """Return the clock of positions or of speeds; None where the turns do not tell."""
+    if samples is None:
+        return None
+    alike = stream.rate is not None and bool(np.isin(
+        samples.stamps_s, stream.rate.stamps_s).mean() > ONE_CLOCK)
+    return offset_of(paths, samples, gyro if alike else None)
+
+
+# share of samples with the stamps of another sensor; with more they are of the same clock
+ONE_CLOCK = 0.9
 
 
 @dataclass(frozen=True)
@@ -193,8 +225,6 @@ def _informed(solution: Solution, fit: Fit, gyro: _OwnScale, config: Config
         scene for scene in scenes if scene is not None)), None
 
 
-# s to either side: clocks of sensors in one car are not farther apart
-LARGEST_OFFSET_S = 0.5
 # of the squared angles; a sensor that explains less is of another drive, or its clock is
 LEAST_EXPLAINED = 0.9
 # times ours; a scale farther off than SCALES, and in between, is one of units
@@ -249,7 +279,7 @@ def _gyro(fit: Fit | None, solution: Solution, own: _OwnScale, apart: str
     sigmas = np.sqrt(np.diag(fit.covariance))
     witness = _witness(gyro.inverse_scale, float(sigmas[6]), own.sigma, fit.by_camera, solution)
     return replace(
-        witness, time_offset_s=gyro.offset_s, time_sigma_s=float(sigmas[7]),
+        witness.timed(clock(gyro.offset_s, float(sigmas[7]), gyro.pace, float(sigmas[8]))),
         camera_from_sensor=tuple(tuple(row) for row in gyro.alignment.tolist()),
         alignment_sigma_deg=float(np.degrees(np.sqrt(np.trace(fit.covariance[:3, :3])))),
         bias_rad_s=tuple(gyro.bias.tolist()), scale_by_gps=own.by_gps), None
@@ -269,6 +299,44 @@ def _witness(inverse_scale: float, sigma: float, own_sigma: float, by_camera: Fl
     return Witness(
         None, None, scale, sigma * scale**2, percent * (1 - inverse_scale), abs(percent) * known,
         bool(abs(1 - inverse_scale) <= CONTRADICTED * np.hypot(known, np.sqrt(variance))))
+
+
+def clock_of_poses(solution: Solution, poses: Poses, config: Config) -> Witness | None:
+    """Return how late the stamps of poses are, by their rotations; None where they do not tell."""
+    if poses.stamps_s is None:
+        return None
+    start_s = float(poses.stamps_s[0])
+    loss_px = loss_px_of(solution.scenes, solution.camera, config.intrinsics)
+    turns = [steps_of(scene, solution, loss_px, start_s) for scene in solution.scenes
+             if scene.turn.of_this_drive and len(scene.observed.keyframes) >= LEAST_KEYFRAMES]
+    rate = _rate_of(poses.stamps_s - start_s, poses.rotations, turns)
+    fit = None if len(rate.stamps_s) < LEAST_KEYFRAMES else fit_to(turns, rate)
+    if (fit is None or fit.out_of_pace or not fit.explained >= LEAST_EXPLAINED
+            or abs(fit.gyro.offset_s) >= LARGEST_OFFSET_S):
+        return None
+    sigmas = np.sqrt(np.diag(fit.covariance))
+    return clock(fit.gyro.offset_s, float(np.hypot(sigmas[7], MADE_S)), fit.gyro.pace,
+                 float(sigmas[8]))
+
+
+# s between the samples of a rate that is made of poses
+POSES_S = 0.01
+
+
+def _rate_of(stamps_s: Floats, rotations: Floats, turns: Sequence[Steps]) -> Samples:
+    """Return how fast what has these rotations (n, 3, 3) to the world turned, about its own axes.
+
+    Only about the time of the turns: poses may be years apart.
+    """
+    from scipy.interpolate import CubicSpline
+    angles = np.cumsum(np.pad(_turned(rotations.transpose(0, 2, 1)), ((1, 0), (0, 0))), axis=0)
+    when = np.unique(np.concatenate([np.zeros(0), *(np.arange(
+        turn.stamps_s[0] - LARGEST_OFFSET_S, turn.stamps_s[-1] + LARGEST_OFFSET_S, POSES_S)
+        for turn in turns)]))
+    when = when[(when >= stamps_s[0]) & (when < stamps_s[-1])]
+    after = np.searchsorted(stamps_s, when, side='right')
+    when = when[np.diff(stamps_s)[after - 1] <= LONGEST_GAP_S]
+    return Samples(when, CubicSpline(stamps_s, angles)(when, 1))
 
 
 @dataclass(frozen=True)
@@ -312,14 +380,15 @@ class Gyro:
                     float(self.pace + step[8]))
 
 
-# of time, one sigma: what a rate that was given with --fps may be off, as the frames of two real
-# drives are; and sigmas beyond which a clock is not used
-PACE, LARGEST_PACE = 0.005, 2.0
+# sigmas of the prior of the pace beyond which a clock is not used
+LARGEST_PACE = 2.0
 # s, and sigmas; turns whose own offsets are farther apart have clocks that do not keep pace
 LARGEST_SKEW_S, SKEW_SIGMAS = 0.02, 5.0
 # times what a turn's other steps leave; where an image is missing in a turn of 50 degrees or more
 # one step left 4.7 to 14 times that, and else 4.2 at the most
 LARGEST_JUMP = 4.5
+# a stretch that turns less shows no missing image, but a bump
+JUMPING_DEG = 30.0
 
 
 @dataclass(frozen=True)
@@ -473,7 +542,9 @@ def _fit_gyro(turns: Sequence[Steps], angles: Samples) -> Fit | None:
     return Fit(gyro, covariance, np.linalg.solve(hessian, jacobian.T @ follow)[6],
                1 - float(np.sum(left**2) / np.sum(turned**2)),
                float(np.max(np.abs(own[:, 1]), where=clear, initial=0.0)),
-               max(_largest(each) for each in lefts))
+               max((_largest(each) for turn, each in zip(turns, lefts, strict=True)
+                    if np.degrees(np.linalg.norm(turn.turned.sum(axis=0))) > JUMPING_DEG),
+                   default=0.0))
 
 
 def _largest(left: Floats) -> float:
@@ -560,11 +631,7 @@ def _whitening(turn: Steps, ratio: float) -> tuple[Floats, float]:
 
     ratio: of the variance of a keyframe's pose to that of the gyro in a second.
     """
-    apart = np.diff(turn.stamps_s)
-    covariance = np.diag(apart + 2 * ratio)
-    for place in range(len(apart) - 1):
-        covariance[place, place + 1] = covariance[place + 1, place] = -ratio
-    root = np.linalg.cholesky(covariance)
+    root = np.linalg.cholesky(of_steps(np.diff(turn.stamps_s), ratio))
     return np.linalg.inv(root), float(np.log(np.diag(root)).sum())
 
 

@@ -18,7 +18,7 @@ from typing import ClassVar, Literal, TypeVar
 
 import numpy as np
 
-from dashcalib_ros.arrays import Floats
+from dashcalib_ros.arrays import Floats, Ints
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.field import TERMS, Field, field_terms
 from dashcalib_ros.camera.mapping import sensitivity, turned
@@ -452,35 +452,44 @@ class Bend(SharedBlock):
 
 @dataclass(frozen=True)
 class Drift(SharedBlock):
-    """By how much the picture is larger at the end of the drive than at its begin, of 1; (1,).
+    """By how much the picture grows during the drive, of 1; (c,), one for each way of growing.
 
-    As of a lens that warms up. begin_ns, end_ns: of the drive. sigma: of the prior. Earlier drives
-    have their own temperature, and none of it.
+    Steadily from its begin to its end, as of a lens that warms up, where steady; and at each of
+    steps_ns, as where somebody touches the lens. begin_ns, end_ns: of the drive. sigma: of the
+    prior. Earlier drives have their own temperature, and none of it.
     """
 
     value: Floats = field(default_factory=lambda: np.zeros(1))
     begin_ns: int = 0
     end_ns: int = 1
     sigma: float = 0.01
+    steady: bool = True
+    steps_ns: tuple[int, ...] = ()
 
     name: ClassVar[str] = 'drift'
 
     def columns(self, seen: Seen) -> Floats:
-        return np.asarray((seen.from_middle * self._late(seen.observed)).T[:, None])
+        return np.asarray(seen.from_middle.T[:, None] * self.grown(seen.observed).T)
 
     def ideal(self, xy: Floats, observed: Observed) -> Floats:
         centre = middle(observed.image_size)
-        return np.asarray(centre + (xy - centre) / (1 + self.value * self._late(observed)))
+        return np.asarray(centre + (xy - centre) / (
+            1 + self.grown(observed) @ self.value)[:, None])
 
     def prior(self) -> tuple[Floats, Floats]:
-        return np.full((1, 1), self.sigma**-2), self.value
+        return np.eye(len(self.value)) * self.sigma**-2, self.value
 
-    def _late(self, observed: Observed) -> Floats:
-        """Return (n, 1) the time of each observation, -0.5 at the begin and 0.5 at the end."""
+    def grown(self, observed: Observed) -> Floats:
+        """Return (n, c) how far each way is at each observation, -0.5 before it and 0.5 after."""
         if not observed.turn.of_this_drive:
-            return np.zeros((len(observed.xy), 1))
-        return ((observed.stamps_ns - self.begin_ns) / (self.end_ns - self.begin_ns)
-                - 0.5)[:, None]
+            return np.zeros((len(observed.xy), len(self.value)))
+        return self.grown_at(observed.stamps_ns)
+
+    def grown_at(self, stamps_ns: Ints) -> Floats:
+        """Return (n, c) the same at stamps (n,)."""
+        late = (stamps_ns - self.begin_ns) / (self.end_ns - self.begin_ns)
+        return np.stack([*([late] if self.steady else []), *(
+            stamps_ns >= step_ns for step_ns in self.steps_ns)], axis=1) - 0.5
 
 
 # what each image has of its own

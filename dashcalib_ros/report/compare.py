@@ -114,7 +114,7 @@ def answer_dict(found: Check, changes: Sequence[str], motion: Odometry | None = 
     values: dict[str, Any] = found.to_dict() | {
         'next_step': found.next_step, 'changes': list(changes), 'mount': mount}
     if motion is not None:
-        values |= motion.medians()
+        values |= motion.medians() | {'clock': motion.clock and motion.clock.clock}
         values['turns'] = [{'center': turn.turn.number, 'true_deg': turn.angle_deg,
                             'length_m': turn.length_m,
                             'rotation_deg': {name: turn.rotation_deg(name)

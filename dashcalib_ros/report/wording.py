@@ -120,19 +120,26 @@ def mount_text(mount: Mount) -> str:
 
 
 def witness_texts(witnesses: Witnesses) -> list[str]:
-    """Return a line for each sensor that knows something of the focal length."""
+    """Return a line for each sensor: what it knows of the focal length, and of its clock."""
     lines = []
-    for name, each in (('gyro', witnesses.gyro), ('GPS', witnesses.gps)):
+    for name, each in (('gyro', witnesses.gyro), ('GPS', witnesses.gps),
+                       ('odometry', witnesses.odometry)):
         if each is None:
             continue
-        text = (f'the {name} {"agrees" if each.agrees else "contradicts"}: fx off by '
-                f'{each.fx_percent:+.2f} ± {each.fx_sigma_percent:.2f} %')
+        parts, word = [], ''
+        if each.fx_percent is not None:
+            word = ' agrees' if each.agrees else ' contradicts'
+            parts.append(f'fx off by {each.fx_percent:+.2f} ± {each.fx_sigma_percent:.2f} %')
         if each.time_offset_s is not None and each.time_sigma_s is not None:
-            text += (f', its time stamps late by {1e3 * each.time_offset_s:.0f} ± '
-                     f'{max(1e3 * each.time_sigma_s, 0.1):.1f} ms')
+            parts.append(f'its time stamps late by {1e3 * each.time_offset_s:.0f} ± '
+                         f'{max(1e3 * each.time_sigma_s, 0.1):.1f} ms')
+        if each.drift_ppm is not None:
+            parts.append(f'its clock drifting by {each.drift_ppm:+.0f} ± '
+                         f'{each.drift_sigma_ppm:.0f} ppm')
         if each.scale_by_gps is not None:
-            text += ', its angles {:.4f} ± {:.4f} times those of GPS'.format(*each.scale_by_gps)
-        lines.append(text)
+            parts.append('its angles {:.4f} ± {:.4f} times those of GPS'.format(
+                *each.scale_by_gps))
+        lines.append(f'the {name}{word}: {", ".join(parts)}')
     return lines
 
 

@@ -12,7 +12,9 @@ is compared with what chance would gain, each track counted as one measurement. 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import accumulate
+from operator import itemgetter
 from typing import Literal
 
 import numpy as np
@@ -30,7 +32,7 @@ from dashcalib_ros.solve.optimise import (
     TEST_LOSS,
     Estimate,
     costs_by_track,
-    likeliest,
+    evidence,
 )
 from dashcalib_ros.solve.written import sees_as_pinhole
 
@@ -51,7 +53,7 @@ SHIFT_SIZES, SHIFT_NATS = (0.0005, 0.001, 0.002, 0.004, 0.008, 0.016), 3.0
 HIDDEN_DEG, SHARP_DEG = 20.0, 45.0
 # sigmas of a drift of the focal length over a drive among which the evidence chooses, the first
 # as good as none, and the nats it takes; turns at the least
-STEADY, DRIFTS, DRIFT_NATS, LEAST_DRIFTING = 1e-6, (0.002, 0.005, 0.015, 0.05), 4.0, 3
+STEADY, DRIFTS, DRIFT_NATS, LEAST_DRIFTING = 1e-6, (0.002, 0.005, 0.015, 0.05, 0.2), 4.0, 3
 # noise variances of a track by which a kind of lens must predict turns better
 LEAST_GAIN = 30.0
 # the same of another kind, of its cost: fisheyes have 0.1 and more, windscreens up to 0.06; and
@@ -314,23 +316,48 @@ def shift_size(found: Estimate) -> float:
 
 
 def drifting(found: Estimate) -> Drift | None:
-    """Return the drift of the focal length that the evidence favours; None for a steady one.
+    """Return how the focal length changes, as the evidence favours it; None for a steady one.
 
-    Two turns cannot tell a drift from a step.
+    It grows steadily, or steps between two turns; or it does all of that, as a zoom, and where the
+    turns do not tell which. Two turns cannot.
     """
-    stamps = [scene.tracks.stamps_ns for scene in found.scenes if scene.turn.of_this_drive]
-    if len(stamps) < LEAST_DRIFTING:
+    turns = sorted((int(stamps.min()), int(stamps.max())) for stamps in (
+        scene.tracks.stamps_ns for scene in found.scenes if scene.turn.of_this_drive))
+    if len(turns) < LEAST_DRIFTING:
         return None
-    begin, end = (int(pick(each)) for pick, each in (
-        (min, map(min, stamps)), (max, map(max, stamps))))
-    sizes = [Drift(begin_ns=begin, end_ns=end, sigma=size) for size in (STEADY, *DRIFTS)]
-    now = found.with_tracks(FIRST_TRACKS).having(sizes[0])
+    begins, ends = [begin for begin, _ in turns], [*accumulate((end for _, end in turns), max)]
+    # where turns overlap nothing steps between them
+    steps = tuple((end + begin) // 2 for end, begin in zip(ends, begins[1:], strict=False)
+                  if end < begin)
+    asked = Drift(np.zeros(1 + len(steps)), begins[0], ends[-1], STEADY, steps_ns=steps)
+    now = found.with_tracks(FIRST_TRACKS).having(asked)
     loss_px = now.loss_px()
     unit = now.noise(loss_px).variance * now.inflation
     total = Quadratic.together([normal_equations(each, unit).cost.at_noise(unit)
                                 for each in now.linear(loss_px)])
-    best = likeliest(total, now.imaging, sizes, DRIFT_NATS)
-    return best if isinstance(best, Drift) and best.sigma > STEADY else None
+    places = np.arange(len(total.score))
+    own = places[now.imaging.places[Drift.name]]
+
+    def likeliest_of(ways: Drift, kept: Ints) -> tuple[float, Drift]:
+        """Return the nats over a steady focal length, and the block of the likeliest size."""
+        cost = total.of(np.setdiff1d(places, np.setdiff1d(own, kept)))
+        sized = [replace(ways, sigma=size) for size in (STEADY, *DRIFTS)]
+        none, *nats = (evidence(cost, now.imaging.having(each), each) for each in sized)
+        return max(nats) - none, sized[1 + int(np.argmax(nats))]
+
+    one = replace(asked, value=np.zeros(1))
+    alone = [likeliest_of(replace(one, steps_ns=()), own[:1])]
+    for place, step_ns in zip(own[1:], steps, strict=True):
+        nats, step = likeliest_of(replace(one, steady=False, steps_ns=(step_ns,)), place)
+        # any of the steps is as likely as a steady growth
+        alone.append((nats - float(np.log(len(steps))), step))
+    (best, way), *others = sorted(alone, key=itemgetter(0), reverse=True)
+    if best <= DRIFT_NATS:
+        return None
+    # where another way may be right, too, the sigma of all of them contains it
+    every, ways = likeliest_of(asked, own)
+    rival = max((nats for nats, _ in others), default=-np.inf)
+    return ways if every > best + DRIFT_NATS or rival > best - DRIFT_NATS else way
 
 
 def moves(tests: Sequence[FixedCameraTest]) -> bool:

@@ -12,7 +12,7 @@ from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.field import Field
 from dashcalib_ros.detect.turn import TurnId
-from dashcalib_ros.problem.blocks import lens_alone
+from dashcalib_ros.problem.blocks import Drift, lens_alone, middle
 from dashcalib_ros.problem.quadratic import NONE, Quadratic
 from dashcalib_ros.reconstruct.scene import Profile, Scene, rms_px
 from dashcalib_ros.solve.evidence import Candidate, FixedCameraTest
@@ -27,12 +27,47 @@ LEAST_TURNS = 3
 class FocalDrift:
     """By how much the focal length grows from the first turn's begin to the last one's end, of 1.
 
-    With its sigma; seconds: between both.
+    With its sigma. ways: in which it grows, as found.
     """
 
     size: float
     sigma: float
-    seconds: float
+    ways: Drift
+
+    @classmethod
+    def of(cls, ways: Drift, covariance: Floats) -> FocalDrift:
+        """Return what these ways add up to. covariance: of what turns share, ways' at its end."""
+        grows = np.diff(ways.grown_at(np.array([ways.begin_ns, ways.end_ns])), axis=0)[0]
+        own = covariance[-len(grows):, -len(grows):]
+        return cls(float(grows @ ways.value), float(np.sqrt(grows @ own @ grows)), ways)
+
+    def moved(self, step: Floats, covariance: Floats) -> FocalDrift:
+        """Return it after a step (m,) of what turns share, with the covariance then."""
+        value = self.ways.value
+        return self.of(replace(self.ways, value=value + step[-len(value):]), covariance)
+
+    @property
+    def largest(self) -> float:
+        """Return by how much it differs at the most between two times of the drive, of 1."""
+        steps_ns = np.array(self.ways.steps_ns, np.int64)
+        grown = self.ways.grown_at(np.r_[
+            self.ways.begin_ns, steps_ns - 1, steps_ns, self.ways.end_ns])
+        return float(np.ptp(grown @ self.ways.value))
+
+    @property
+    def seconds(self) -> float:
+        """Return the time from the first turn's begin to the last one's end."""
+        return (self.ways.end_ns - self.ways.begin_ns) / 1e9
+
+    @property
+    def step_ns(self) -> int | None:
+        """Return when it steps; None where it does anything else."""
+        return None if self.ways.steady else self.ways.steps_ns[0]
+
+    @property
+    def linear(self) -> bool:
+        """Return whether it grows steadily, and nothing else."""
+        return not self.ways.steps_ns
 
 
 @dataclass(frozen=True)
@@ -51,9 +86,10 @@ class Solution:
     that it is not first. crops: by turn (k, 2) px, how far a stabiliser moved each keyframe's
     picture; empty for a fixed picture. perhaps_shifted: turns so gentle that a stabiliser might
     have shifted their pictures: each may be, and sigma contains it. fixed: it is known that there
-    is no stabiliser. drift: of the focal length, which is that of the middle of the drive then.
-    unsettled: how far the last step moved the rays over the picture, in
-    their sigma. field_sigma: px, of the prior of the field's directions.
+    is no stabiliser. drift: of the focal length, which is that of the middle of the drive then;
+    parts: of a step, the solutions of the turns before it and of those later. unsettled: how far
+    the last step moved the rays over the picture, in their sigma. field_sigma: px, of the prior of
+    the field's directions.
     by_pictures: the solution of the pictures alone, where a gyro's angles are in this one. px: of
     the input's pictures, in one pixel of the scenes.
     """
@@ -74,6 +110,7 @@ class Solution:
     perhaps_shifted: frozenset[TurnId] = frozenset()
     fixed: bool = False
     drift: FocalDrift | None = None
+    parts: tuple[Solution | None, ...] = ()
     unsettled: float = 0.0
     field_sigma: float = 0.0
     by_pictures: Solution | None = None
@@ -98,6 +135,23 @@ class Solution:
     def covariance(self) -> Floats:
         """Return the covariance (n, n) of the camera's parameters."""
         return self.carried(self.posterior.covariance)
+
+    def at(self, stamp_ns: int) -> tuple[Camera, Floats]:
+        """Return the camera at a time of the drive, and its n standard deviations (n,)."""
+        camera, count = self.camera, len(self.camera.params)
+        if self.drift is None:
+            return camera, self.sigma
+        ways = self.drift.ways
+        grown = ways.grown_at(np.array([stamp_ns]))[0]
+        times = np.where(np.arange(count) < 4, 1 + grown @ ways.value, 1.0)
+        # where the picture grows about its middle, fx, fy and the centre go with it
+        still = np.r_[0.0, 0.0, middle(camera.image_size), np.zeros(count - 4)]
+        moves = np.where(np.arange(count) < 4, camera.params - still, 0.0)
+        follow = times[:, None] * self.written.by_solution
+        follow[:, follow.shape[1] - len(grown):] += np.outer(moves, grown)
+        covariance = follow @ self.posterior.covariance @ follow.T + self.written.loose
+        return (camera.with_params(still + times * (camera.params - still)),
+                np.sqrt(np.diag(covariance)))
 
     @property
     def wide_covariance(self) -> Floats:
@@ -215,7 +269,9 @@ def with_measurement(solution: Solution, along: Floats, apart: float, variance: 
     moved = replace(known, further=(*known.further, further))
     step, place = moved.offset - known.offset, len(known.lens.params)
     return replace(
-        solution, posterior=moved, readout_s=solution.readout_s + float(step[place]),
+        solution, posterior=moved,
+        drift=solution.drift and solution.drift.moved(step, moved.covariance),
+        readout_s=solution.readout_s + float(step[place]),
         readout_sigma_s=float(np.sqrt(moved.covariance[place, place])),
         written=replace(solution.written, camera=solution.camera.with_params(
             solution.camera.params + solution.written.by_solution @ step)))

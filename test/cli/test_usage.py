@@ -223,6 +223,7 @@ def test_version():
     (['compare', 'a'], 'B'),
     (['export', 'a'], '--to'),
     (['export', 'a', '--to', 'ros', '--size', '640'], '1280x720'),
+    (['export', 'a', '--to', 'ros', '--at', 'noon'], '12.5s'),
     (['export', 'a', '--to', 'ros', '--crop', '0,0,x,9'], '0,100,1280,520'),
     (['export', 'a', '--to', 'ros', '--crop', '0,0,9,9', '--size', '9x9'], 'not allowed'),
 ])
@@ -319,6 +320,18 @@ def test_export_tells_where_the_field_over_the_picture_goes(here, results, tmp_p
     part = here('export', path, '--to', 'mrcal', '--crop', '0,0,640,375')
     assert_one_line_error(part)
     assert '[E-FIELD-OF-PART]' in part.stderr
+
+
+def test_export_writes_the_camera_of_a_time(here, results, tmp_path):
+    data = json.loads((results / 'a/result.json').read_text())
+    given, path = data['intrinsics'], tmp_path / 'result.json'
+    data['intrinsics_at'] = [
+        {'time_s': time_s, 'intrinsics': {**given, 'fx': times * given['fx']},
+         'sigma': data['sigma']} for time_s, times in ((10.0, 1.0), (20.0, 1.02))]
+    path.write_text(json.dumps(data))
+    written = here('export', path, '--to', 'nerfstudio', '--at', '12.5s')
+    assert written.returncode == 0
+    assert json.loads(written.stdout)['fl_x'] == pytest.approx(1.005 * given['fx'])
 
 
 def test_a_lens_profile_has_the_readout_time_of_its_rows(here, results, tmp_path):

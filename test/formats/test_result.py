@@ -16,9 +16,16 @@ from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import InputError, Notice
 from dashcalib_ros.formats import load_calibration, result_dict, result_json
 from dashcalib_ros.judge import Verdict
-from dashcalib_ros.judge.calibration import StoredTurnSummary, Witness, Witnesses
+from dashcalib_ros.judge.calibration import (
+    CameraAt,
+    Part,
+    StoredTurnSummary,
+    Witness,
+    Witnesses,
+)
 from dashcalib_ros.report.page import report_html
 from dashcalib_ros.report.tables import summary
+from dashcalib_ros.solve.spread import PictureSigma
 
 
 def test_stored_turns_are_apart_as_they_count_no_frames_of_this_input():
@@ -38,7 +45,8 @@ def test_stored_turns_are_apart_as_they_count_no_frames_of_this_input():
 def test_witnesses_are_written_and_read_and_told_in_one_line(tmp_path):
     said = Witness(0.04, 0.0006, 1.0012, 0.0011, -0.13, 0.14, True,
                    ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), 0.4, (0.01, 0.0, -0.02))
-    calibration = make_calibration(witnesses=Witnesses(gyro=said))
+    clock = Witness(0.21, 0.02, drift_ppm=30.0, drift_sigma_ppm=90.0)
+    calibration = make_calibration(witnesses=Witnesses(gyro=said, odometry=clock))
     result = strict(result_json(calibration))
     assert result['witnesses']['gps'] is None
     gyro = result['witnesses']['gyro']
@@ -50,8 +58,29 @@ def test_witnesses_are_written_and_read_and_told_in_one_line(tmp_path):
     assert line in report_html(calibration)
     console = Console(width=200, file=io.StringIO())
     console.print(summary(calibration))
-    assert line in console.file.getvalue()
-    assert result_dict(make_calibration())['witnesses'] == {'gyro': None, 'gps': None}
+    assert line in console.file.getvalue() and 'late by 210 ± 20.0 ms' in console.file.getvalue()
+    nothing = result_dict(make_calibration())['witnesses']
+    assert nothing == dict.fromkeys(('gyro', 'gps', 'odometry'))
+
+
+def test_a_camera_that_steps_is_written_and_read_with_both_sides(tmp_path):
+    def at(time_s, times):
+        return CameraAt(time_s, {**TRUTH.named, 'fx': times * TRUTH.fx}, SIGMA)
+
+    parts = (Part(1.0, 30.0, 'accepted', (), (), 'radial', TRUTH.named, SIGMA,
+                  PictureSigma(0.3, 0.9)),
+             Part(50.0, 80.0, 'refused', ('too few turns',), ('E-FEW-TURNS',), None, None, None))
+    calibration = make_calibration('weak', parts=parts, intrinsics_at=(
+        at(1.0, 0.99), at(30.0, 0.99), at(50.0, 1.01), at(80.0, 1.01)))
+    (tmp_path / 'result.json').write_text(result_json(calibration))
+    read = load_calibration(tmp_path)
+    assert read.parts == parts and read.intrinsics_at == calibration.intrinsics_at
+    for time_s, times in ((0.0, 0.99), (35.0, 0.99), (45.0, 1.01), (99.0, 1.01)):
+        camera, sigma = read.at(time_s)
+        assert camera.fx == pytest.approx(times * TRUTH.fx) and sigma == SIGMA
+    drifting = make_calibration(intrinsics_at=(at(0.0, 1.0), at(100.0, 1.02)))
+    assert drifting.at(25.0)[0].fx == pytest.approx(1.005 * TRUTH.fx)
+    assert make_calibration().at(25.0) == (TRUTH, SIGMA)
 
 
 def strict(text):

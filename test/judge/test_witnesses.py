@@ -14,8 +14,9 @@ from towns import town
 
 from dashcalib_ros.config import VerdictConfig
 from dashcalib_ros.input.motion import Samples, SensorStream
+from dashcalib_ros.input.poses import Poses
 from dashcalib_ros.judge.verdict import judge
-from dashcalib_ros.judge.witnesses import PACE, compare_sensors, fit_to, steps_of
+from dashcalib_ros.judge.witnesses import PACE, clock_of_poses, compare_sensors, fit_to, steps_of
 from dashcalib_ros.solve.start import scene_with
 
 TURNS = 4
@@ -338,3 +339,22 @@ def test_a_scale_that_gps_contradicts_is_named_and_not_used(drive, alone):
     assert 'E-GYRO-SCALE' in [each.code for each in found.unused]
     assert found.witnesses.gyro.agrees
     assert abs(found.solution.camera.fx - LENS.fx) < 3 * found.solution.sigma[0]
+
+
+def test_the_clock_of_poses_is_found_by_their_rotations(drive):
+    solution, when, rates = drive
+    even = np.arange(when[0], when[-1], 0.02)
+    steps = Rotation.from_rotvec(0.02 * Samples(when, rates).at(even + 0.01))
+    turned = [np.eye(3)]
+    for step in steps.as_matrix()[:-1]:
+        turned.append(turned[-1] @ step)
+    poses = Poses(np.array(turned) @ MOUNT.as_matrix(), np.zeros((len(even), 3)),
+                  START_S + even + LATE_S)
+    found = clock_of_poses(solution, poses, CONFIG)
+    assert abs(found.time_offset_s - LATE_S) < 2 * found.time_sigma_s < 0.01
+    assert clock_of_poses(solution, dataclasses.replace(poses, stamps_s=None), CONFIG) is None
+    # one that is thousands of years later takes no memory
+    later = Poses(np.r_[poses.rotations, poses.rotations[-1:]], np.zeros((len(even) + 1, 3)),
+                  np.r_[poses.stamps_s, 1e11])
+    again = clock_of_poses(solution, later, CONFIG)
+    assert again.time_offset_s == pytest.approx(found.time_offset_s, abs=1e-4)

@@ -2,6 +2,7 @@
 """A focal length that changes with time: found where it does, and not named where it does not."""
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,9 @@ from solving import CONFIG, scenes_of, solved
 from synthetic import LENS, SIZE
 
 from dashcalib_ros.judge.verdict import judge
+from dashcalib_ros.problem.blocks import Drift
 from dashcalib_ros.reconstruct.scene import Scene
+from dashcalib_ros.solve.solution import FocalDrift, with_measurement
 
 pytestmark = pytest.mark.usefixtures('no_profile')
 
@@ -19,10 +22,13 @@ MIDDLE = (np.array(SIZE) - 1) / 2
 
 def warming(size: float, count: int = 5) -> list[Scene]:
     """Return turns, a minute apart, whose pictures grow by size from the first to the last."""
-    scenes = scenes_of(count, tracks=150)
-    found = []
-    for n, scene in enumerate(scenes):
-        zoom = 1 + size * (n / (count - 1) - 0.5)
+    return zoomed([1 + size * (n / (count - 1) - 0.5) for n in range(count)])
+
+
+def zoomed(zooms: Sequence[float]) -> list[Scene]:
+    """Return turns, a minute apart, whose pictures are so many times as large."""
+    scenes, found = scenes_of(len(zooms), tracks=150), []
+    for n, (scene, zoom) in enumerate(zip(scenes, zooms, strict=True)):
         tracks = replace(scene.tracks, xy=MIDDLE + (scene.tracks.xy - MIDDLE) * zoom,
                          stamps_ns=scene.tracks.stamps_ns + n * 60 * 10**9)
         found.append(replace(scene, tracks=tracks))
@@ -39,6 +45,18 @@ def test_a_lens_that_warms_up_is_measured(size):
     assert 'E-FOCAL-LENGTH-DRIFTS' not in judge(solution, CONFIG.verdict).codes
 
 
+def test_what_is_known_of_a_drift_moves_it():
+    solution = solved(warming(0.02))
+    along = np.eye(len(solution.posterior.prior.score))[-1]
+    found = with_measurement(solution, along, 0.001, 1e-12)
+    assert found.drift is not None and solution.drift is not None
+    assert found.drift.size == pytest.approx(solution.drift.size + 0.001, abs=1e-6)
+    assert found.drift.sigma < 1e-5
+    last_ns = solution.drift.ways.end_ns
+    grown = found.at(last_ns)[0].fx / found.camera.fx
+    assert grown == pytest.approx(1 + found.drift.size / 2)
+
+
 def test_a_steady_lens_has_no_drift():
     assert solved(warming(0.0)).drift is None
 
@@ -49,3 +67,53 @@ def test_two_turns_cannot_tell():
 
 def test_a_large_drift_has_no_camera_info():
     assert 'E-FOCAL-LENGTH-DRIFTS' in judge(solved(warming(0.05)), CONFIG.verdict).codes
+
+
+def test_a_step_is_found_at_its_place_with_a_calibration_of_each_side():
+    solution = solved(zoomed([1.0, 1.0, 1.02, 1.02, 1.02]))
+    drift = solution.drift
+    assert drift is not None and drift.step_ns is not None and not drift.linear
+    assert 60e9 < drift.step_ns < 120e9
+    assert abs(drift.size - 0.02 / 1.01) < 3 * drift.sigma < 0.01
+    for part, zoom in zip(solution.parts, (1.0, 1.02), strict=True):
+        assert part is not None and abs(part.camera.fx - zoom * LENS.fx) < 3 * part.sigma[0]
+    for turn, zoom in ((1, 1.0), (3, 1.02)):
+        camera, sigma = solution.at(turn * 60 * 10**9)
+        assert abs(camera.fx - zoom * LENS.fx) < 3 * sigma[0] < 0.01 * LENS.fx
+    assert 'E-FOCAL-LENGTH-STEPS' in judge(solution, CONFIG.verdict).codes
+
+
+def test_it_is_not_said_how_it_changes_where_turns_do_not_tell():
+    zooms = [1.0, 1.0, 1.015]
+    solution = solved(zoomed(zooms))
+    assert solution.drift is not None and solution.parts == ()
+    assert not solution.drift.linear and solution.drift.step_ns is None
+    for turn, zoom in enumerate(zooms):
+        camera, sigma = solution.at(turn * 60 * 10**9 + 10**9)
+        assert abs(camera.fx - zoom * LENS.fx) < 3 * sigma[0]
+
+
+def test_a_zoom_in_and_back_changes_as_much_as_in_between():
+    ways = Drift(np.array([0.0, 0.3, -0.3]), 0, 100, steps_ns=(30, 60))
+    found = FocalDrift.of(ways, np.eye(9))
+    assert found.size == pytest.approx(0.0) and found.largest == pytest.approx(0.3)
+
+
+def test_nothing_steps_between_turns_that_overlap():
+    first, *others = zoomed([1.0, 1.05, 1.05])
+    apart_ns = int(others[0].tracks.stamps_ns[0])
+    within = [replace(scene, tracks=replace(
+        scene.tracks, stamps_ns=(scene.tracks.stamps_ns - n * apart_ns) // 2 + 10**9))
+        for n, scene in enumerate(others, 1)]
+    found = solved([first, *within])
+    assert found.drift is None or found.drift.linear
+    assert found.parts == ()
+
+
+def test_a_zoom_has_a_focal_length_at_each_turn():
+    zooms = [1.0, 1.05, 1.2, 1.22, 1.3]
+    solution = solved(zoomed(zooms))
+    assert 'E-FOCAL-LENGTH-DRIFTS' in judge(solution, CONFIG.verdict).codes
+    for turn, zoom in enumerate(zooms):
+        camera, sigma = solution.at(turn * 60 * 10**9 + 10**9)
+        assert abs(camera.fx - zoom * LENS.fx) < 3 * sigma[0] < 0.03 * zoom * LENS.fx
