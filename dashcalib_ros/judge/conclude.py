@@ -246,8 +246,8 @@ def _part(part: Solution | None, whole: Solution, later: int, evidence: Evidence
     from_s, to_s = (float(pick(each)) / 1e9 - evidence.start_s for pick, each in (
         (min, map(min, stamps)), (max, map(max, stamps))))
     if part is None:
-        verdict = Verdict('refused', ('no camera follows from its turns',),
-                          codes=('E-UNDETERMINED',))
+        verdict = Verdict('refused', (
+            Notice('E-UNDETERMINED', 'no camera follows from its turns'),))
     else:
         part = replace(part, px=whole.px)
         verdict = judge(part, config.verdict)
