@@ -250,7 +250,7 @@ def test_a_full_disk_ends_it_and_publishes_no_refusal(manifest, reference, tmp_p
 def test_a_full_scratch_disk_is_no_fault_of_a_clip(manifest, tmp_path, monkeypatch):
     def full(path):
         raise OSError(errno.ENOSPC, 'No space left on device')
-    monkeypatch.setattr('dashcalib_ros.fleet.clips.local_copy', full)
+    monkeypatch.setattr('dashcalib_ros.fleet.storage.local_copy', full)
     with pytest.raises(OutputError) as caught:
         run(manifest, tmp_path)
     assert caught.value.code == 'E-SCRATCH-FULL'
