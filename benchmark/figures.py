@@ -30,8 +30,9 @@ Source = Callable[[str], list[str]]
 class Figure:
     """A place on a page that says what a table says.
 
-    place: text of the page, once in it; each # is a number, @ the table's commits as its link.
-    sources: what returns the numbers, in their order, from the table's text; [] where it does not.
+    place: text of the page, once in it, however wrapped; each # is a number, @ the table's commits
+    as its link. sources: what returns the numbers, in their order, from the table's text; [] where
+    it does not.
     """
 
     page: str
@@ -42,8 +43,8 @@ class Figure:
     @property
     def pattern(self) -> re.Pattern[str]:
         """Return what the place looks like with any figures."""
-        escaped = re.escape(self.place).replace('\\#', NUMBER)
-        return re.compile(escaped.replace('@', rf'\[{COMMITS}\]\({re.escape(self.link)}\)'))
+        spaced = re.escape(self.place).replace('\\ ', r'\s+').replace('\\#', f'({NUMBER})')
+        return re.compile(spaced.replace('@', rf'(\[{COMMITS}\]\({re.escape(self.link)}\))'))
 
     @property
     def link(self) -> str:
@@ -57,12 +58,16 @@ class Figure:
         if len(numbers) != self.place.count('#'):
             raise ValueError(f'{self.table}.md has {numbers} for "{self.place}" of {self.page}')
         commits = f'[{commits_of(table)}]({self.link})'
-        said = re.sub('[#@]', lambda each: commits if each[0] == '@' else numbers.pop(0),
-                      self.place)
-        found, count = self.pattern.subn(lambda _: said, text)
-        if count != 1:
-            raise ValueError(f'{self.page} has {count} places "{self.place}", not one')
-        return found
+        new = [commits if each == '@' else numbers.pop(0)
+               for each in re.findall('[#@]', self.place)]
+        places = [*self.pattern.finditer(text)]
+        if len(places) != 1:
+            raise ValueError(f'{self.page} has {len(places)} places "{self.place}", not one')
+        # lines end where they did
+        for group in reversed(range(len(new))):
+            begin, end = places[0].span(group + 1)
+            text = text[:begin] + new[group] + text[end:]
+        return text
 
 
 def table_of(name: str) -> str:
@@ -246,7 +251,7 @@ FIGURES = (
         *fx_of('fx, px', 'kitti03', 'kitti07'), *fx_of('judged by', 'kitti03', 'kitti07'))),
     Figure(README, '| fx # px; the chessboard has # px | @ |', 'real', (
         *fx_of('fx, px', 'kitti_raw'), *fx_of('judged by', 'kitti_raw'))),
-    Figure(README, '| # of # accepted, the others weak; fx # % off in the median, # % at the '
+    Figure(README, '| # of # accepted, the others weak; fx # % off in the median, # % at '
            'most; no parameter more than # sigma | @ |', 'accuracy', (settings,)),
     Figure(README, '| # of # refused | @ |', 'accuracy', (refused,)),
     Figure(README, '| # videos, # accepted, # of them wrong | @ |', 'attacks', (attacks,)),

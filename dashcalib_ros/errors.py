@@ -26,11 +26,16 @@ def one_line(error: BaseException, limit: int = 160) -> str:
     return shortened(' '.join(str(error).split()) or type(error).__name__, limit)
 
 
-def coded(message: Exception | Notice, limit: int = 1000) -> str:
+def coded(message: Exception | str, limit: int = 1000) -> str:
     """Return a message on one line, with its code at the end if it has one."""
     text = shortened(message, limit) if isinstance(message, str) else one_line(message, limit)
-    code = message.code if isinstance(message, (DashcalibError, Notice)) else ''
+    code = code_of(message)
     return text + (f' [{code}]' if code else '')
+
+
+def code_of(message: object) -> str:
+    """Return the code of an error or a notice, '' for what has none."""
+    return message.code if isinstance(message, (DashcalibError, Notice)) else ''
 
 
 def spared(what: str, lost: list[Notice], make: Callable[..., T], *arguments: object) -> T | None:
@@ -51,19 +56,22 @@ def spared(what: str, lost: list[Notice], make: Callable[..., T], *arguments: ob
 class Notice(str):
     """A warning, or another line for the user that is no error, with a code as errors have it.
 
-    It is a string: the code is for scripts, and stays when the text is reworded.
+    It is a string, 'what: remedy', for people. The code is for scripts, and stays when the text
+    is reworded.
     """
 
     code: str
+    what: str
+    remedy: str
 
-    def __new__(cls, code: str, text: str) -> Notice:
-        """code: such as E-RATE-ASSUMED, or that of an error. text: one line."""
-        notice = super().__new__(cls, text)
-        notice.code = code
+    def __new__(cls, code: str, what: str, remedy: str = '') -> Notice:
+        """code: such as E-RATE-ASSUMED, or that of an error. what, remedy: parts of one line."""
+        notice = super().__new__(cls, f'{what}: {remedy}' if remedy else what)
+        notice.code, notice.what, notice.remedy = code, what, remedy
         return notice
 
-    def __getnewargs__(self) -> tuple[str, str]:  # type: ignore[override]
-        return self.code, str(self)
+    def __getnewargs__(self) -> tuple[str, str, str]:  # type: ignore[override]
+        return self.code, self.what, self.remedy
 
 
 def shortened(text: str, limit: int = 160) -> str:

@@ -2,7 +2,7 @@
 """Limits for all files and messages from outside: sizes, depths and numbers of values.
 
 All code that reads such input checks it here first. Input beyond a limit raises InputError before
-memory or time is spent on it. What comes from outside takes 1 GB of memory at the most beside the
+memory or time is spent on it. What comes from outside takes 1 GB of memory at most beside the
 pictures that are worked on, but for a fleet's manifest (10 kB for each camera), and time that
 grows with its size and no faster.
 """
@@ -107,7 +107,7 @@ def path_of(given: object, cure: str = 'pass the path of a file or of a folder')
 
 
 def check_file(path: Path, what: str = '', limit: int | None = None) -> None:
-    """Raise InputError unless this is a regular file, of `limit` bytes at the most; or OSError.
+    """Raise InputError unless this is a regular file, of `limit` bytes at most; or OSError.
 
     what: the file's name in errors. Reading a pipe would block, and a device has no end.
     """
@@ -123,7 +123,7 @@ def check_file(path: Path, what: str = '', limit: int | None = None) -> None:
 
 
 def read_file(path: Path, limit: int, what: str = '') -> bytes:
-    """Return the bytes of a regular file, `limit` at the most; raises InputError."""
+    """Return the bytes of a regular file, `limit` at most; raises InputError."""
     what = what or str(path)
     with _opened(path, limit, what) as file:
         data = file.read(limit + 1)  # files of /proc have no size, and files may grow
@@ -152,7 +152,7 @@ def _too_large(what: str, limit: int) -> InputError:
 
 
 def read_text(path: Path, limit: int, what: str = '') -> str:
-    """Return the text of a regular file of `limit` bytes at the most; raises InputError."""
+    """Return the text of a regular file of `limit` bytes at most; raises InputError."""
     data = read_file(path, limit, what)
     try:
         return data.decode('utf-8-sig')
@@ -161,7 +161,7 @@ def read_text(path: Path, limit: int, what: str = '') -> str:
 
 
 def read_lines(path: Path, limit: int, what: str = '') -> Iterator[str]:
-    """Yield the lines of a text file of `limit` bytes at the most; raises InputError.
+    """Yield the lines of a text file of `limit` bytes at most; raises InputError.
 
     One line at a time is in memory. One that is longer than LINE comes in parts.
     """

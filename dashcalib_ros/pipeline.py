@@ -225,7 +225,6 @@ class Calibrator:
         return self._judge(sensors, started)  # one camera -> verdict
 
     def _solve(self, progress: Progress, final: bool) -> tuple[list[Scene], Solution | None]:
-        """Return the scenes that count, and the camera that explains them; None without any."""
         config = self.scenes.config
         while scenes := self.scenes.wanted(progress, final):
             stood = spared('what the speed says of the turns', self._lost, turns_that_stood,
@@ -356,7 +355,6 @@ class Calibrator:
         return found and (float(straights.stamps_s[-1] - found[0]), found[1])
 
     def _resized(self, camera: Camera) -> Camera:
-        """Return a camera of the resized pictures."""
         size, scale = self.detection.size, self.detection.scale
         if camera.image_size != size:
             raise InputError('E-CALIBRATION-SIZE',

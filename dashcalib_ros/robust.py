@@ -126,7 +126,7 @@ class EvenlySpaced(Generic[T]):
     """
 
     def __init__(self, period_s: float, capacity: int) -> None:
-        """period_s: between two items, at first. capacity: items at the most."""
+        """period_s: between two items, at first. capacity: items at most."""
         self.items: list[tuple[int, T]] = []
         self._period_ns = period_s * 1e9
         self._capacity = capacity

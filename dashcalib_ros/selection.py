@@ -227,7 +227,6 @@ class SceneSelection:
                     self._detection.release(turn.center)
 
     def _set_aside(self, turn: Turn) -> None:
-        """Move the pictures of a turn that waits out of the memory."""
         images = in_a_file([frame.image for frame in turn.frames])
         self._detection.exchange(turn.center, tuple(
             replace(frame, image=image)

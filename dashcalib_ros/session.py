@@ -185,10 +185,6 @@ def learned_drive(drive: Recording, config: Config | None, observer: Observer, v
 
 
 def _feed(taker: Calibrator, drive: Recording, observer: Observer) -> None:
-    """Push every frame of the drive.
-
-    Raises InputError for a mask of another size.
-    """
     count = drive.source.count
     observer.show('reading', None)
     for number, frame in enumerate(_read_ahead(drive.source), 1):
@@ -262,10 +258,7 @@ def with_source(calibration: Calibration, source: FrameSource) -> Calibration:
     new = tuple(line for line in source.warnings
                 if line not in (*doubts, *calibration.warnings))
     if doubts:
-        cures = (line.rpartition(': ')[2] for line in doubts)
-        verdict = replace(verdict, reasons=(*doubts, *verdict.reasons),
-                          cures=(*cures, *verdict.cures),
-                          codes=(*(each.code for each in doubts), *verdict.codes))
+        verdict = replace(verdict, reasons=(*doubts, *verdict.reasons))
     if material is not None:
         coloured = spared('the pictures in colour', lost, _in_colour, material, source)
         material = coloured or material
@@ -288,7 +281,6 @@ def with_source(calibration: Calibration, source: FrameSource) -> Calibration:
 
 
 def _in_colour(material: Material, source: FrameSource) -> Material:
-    """Return the same with the input's pictures, where they can be read again."""
     shown = material.pictures
     images = source.in_colour({each.frame: each.stamp_ns for each in shown.values()})
     return replace(material, pictures={

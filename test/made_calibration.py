@@ -8,6 +8,7 @@ import numpy as np
 
 from dashcalib_ros.camera import Brown, Fisheye, Radial, Rational
 from dashcalib_ros.config import Config
+from dashcalib_ros.errors import Notice
 from dashcalib_ros.judge import TurnSummary, Verdict
 from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.report import Calibration
@@ -46,7 +47,7 @@ def make_calibration(level='accepted', **changes):
     mask = np.ones((375, 1242), bool)
     mask[300:] = False
     calibration = Calibration(
-        verdict=Verdict(level, () if level == 'accepted' else ('only 1 of 5 turns',)),
+        verdict=Verdict(level, () if level == 'accepted' else (Notice('', 'only 1 of 5 turns'),)),
         image_size=SIZE,
         camera=None if level == 'refused' else TRUTH,
         sigma=None if level == 'refused' else SIGMA,

@@ -13,6 +13,7 @@ from std_srvs.srv import Trigger
 
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import Config
+from dashcalib_ros.errors import Notice
 from dashcalib_ros.judge import Verdict
 from dashcalib_ros.report import Calibration
 from dashcalib_ros.ros import drive as drive_module
@@ -88,9 +89,9 @@ class Desk:
         """Let the learner's thread come up with a calibration."""
         camera = dataclasses.replace(FIRST, **changes) if level != 'refused' else None
         calibration = Calibration(
-            Verdict(level, () if level == 'accepted' else ('few turns',)), (320, 240), camera,
-            sigma if camera else None, turns, 10, 0.3, {}, {}, Config(), warnings=warnings,
-            mount=mount)
+            Verdict(level, () if level == 'accepted' else (Notice('', 'few turns'),)),
+            (320, 240), camera, sigma if camera else None, turns, 10, 0.3, {}, {}, Config(),
+            warnings=warnings, mount=mount)
         result = Result(calibration, complete, self.drive.learner.bank)
         done = []
         self.drive._later(lambda: self.drive.on_result(result))

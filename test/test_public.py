@@ -35,7 +35,7 @@ from dashcalib_ros import (
     open_frames,
     session,
 )
-from dashcalib_ros.errors import DashcalibError, InputError, NotAcceptedError
+from dashcalib_ros.errors import DashcalibError, InputError, NotAcceptedError, Notice
 from dashcalib_ros.formats import given_camera
 from dashcalib_ros.input.motion import SensorStream
 
@@ -256,11 +256,11 @@ def test_results_are_plain_values_and_one_line():
 
 
 def test_a_notebook_shows_a_result():
-    weak = make_calibration('weak', verdict=Verdict('weak', ('<b>dark</b>',)))
+    weak = make_calibration('weak', verdict=Verdict('weak', (Notice('', '<b>dark</b>'),)))
     page = weak._repr_html_()
     assert '<b>weak</b>' in page and '&lt;b&gt;dark' in page and '721.54 px' in page
-    assert 'dark' in make_calibration(verdict=Verdict('refused', ('dark', 'few')),
-                                      camera=None)._repr_html_()
+    assert 'dark' in make_calibration(verdict=Verdict(
+        'refused', (Notice('', 'dark'), Notice('', 'few'))), camera=None)._repr_html_()
 
 
 def test_accepted_returns_the_same_result_or_raises_with_the_reasons():

@@ -82,7 +82,6 @@ def _odd(name: str, matrix: Floats, wanted: npt.ArrayLike) -> list[str]:
 
 
 def _of_another_picture(camera: Camera, view: Floats) -> list[str]:
-    """Return whether a rectified picture (3, 3) does not show what the camera sees."""
     size = np.array(camera.image_size)
     middle, low, high = (share * (size - 1) for share in (0.5, 0.25, 0.75))
     with np.errstate(all='ignore'):

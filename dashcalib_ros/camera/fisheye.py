@@ -113,7 +113,7 @@ class Fisheye(Camera):
 
     @cached_property
     def fold(self) -> float:
-        """Return the angle at which the model folds over, WIDEST at the most; radians."""
+        """Return the angle at which the model folds over, WIDEST at most; radians."""
         slope = np.array([9 * self.k4, 7 * self.k3, 5 * self.k2, 3 * self.k1, 1.0])
         roots = np.roots(np.where(np.abs(slope) < TINY, 0.0, slope))
         squares = roots[np.abs(roots.imag) < 1e-9].real

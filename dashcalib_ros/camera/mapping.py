@@ -27,7 +27,7 @@ GRID = (25, 15)
 UNSEEN_PX = 100.0
 # degrees off the axis; cameras that do not see behind are compared up to here
 IN_FRONT_DEG = 88.0
-# of the search for the best rotation: steps at the most, parts of one that are tried, and the
+# of the search for the best rotation: steps at most, parts of one that are tried, and the
 # relative gain that ends it
 ROTATIONS, PARTS, SETTLED = 50, tuple(0.5**n for n in range(8)), 1e-12
 # px; cameras that are this near need no fit

@@ -70,7 +70,6 @@ class Radial(Camera):
         return np.stack([self.fx * x + self.cx, self.fy * y + self.cy], axis=-1)
 
     def _stretch(self, square: Floats) -> Floats:
-        """Return the radial factor at squared radii (...)."""
         k1, k2, _, _, k3 = self.ros_distortion()
         return 1 + square * (k1 + square * (k2 + square * k3))
 
@@ -231,7 +230,6 @@ class Rational(Brown):
 
 
 def _unit(xy: Floats) -> Floats:
-    """Return unit rays (..., 3) through x, y (..., 2) at depth 1."""
     rays = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
     return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
 

@@ -119,7 +119,6 @@ def _matrix(camera: Camera, centre: Floats, focal: float) -> Floats:
 
 
 def _border(size: tuple[int, int], points: int) -> Floats:
-    """Return (4 points, 2) pixels all around a picture."""
     x, y = (np.linspace(0, side - 1, points) for side in size)
     right, bottom = x[-1], y[-1]
     return np.concatenate([
@@ -129,7 +128,6 @@ def _border(size: tuple[int, int], points: int) -> Floats:
 
 
 def _outline(camera: Camera) -> Floats:
-    """Return (n, 2) points at depth 1 all around what the lens sees."""
     centre = np.array([camera.cx, camera.cy])
     reach = _border(camera.image_size, SIDE_POINTS) - centre
     seen, unseen = np.zeros(len(reach)), np.ones(len(reach))

@@ -82,7 +82,6 @@ def arguments_of(argv: Sequence[str]) -> list[str]:
 
 
 def _command_for(word: str) -> str:
-    """Return a hint for a word that is no command: it may be a drive."""
     if not word.lower().endswith(NO_DRIVES) and (
             os.path.lexists(word) or set(word) & {os.sep, '.', '*', '?'}):
         return f'did you mean `{PROGRAM} run {shlex.quote(word)}`?'
@@ -92,8 +91,6 @@ def _command_for(word: str) -> str:
 
 
 class _Lines(argparse.HelpFormatter):
-    """Keeps the lines of an epilog apart."""
-
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         return '\n'.join(super(_Lines, self)._fill_text(line, width, indent)
                          for line in text.split('\n'))
@@ -125,7 +122,6 @@ class Parser(argparse.ArgumentParser):
 
 
 def _nearest(unknown: Iterable[str], flags: Iterable[str]) -> list[str]:
-    """Return the flag that is most like each unknown one."""
     known = list(flags)
     return [near for each in unknown if each.startswith('-')
             for near in difflib.get_close_matches(each.partition('=')[0], known, 1)]

@@ -13,7 +13,7 @@ from typing import Any
 
 from dashcalib_ros.cli.arguments import ACCEPTED, NOT_ENOUGH
 from dashcalib_ros.cli.drive import read_config
-from dashcalib_ros.cli.terminal import Screen, Stages, warn
+from dashcalib_ros.cli.terminal import Screen, Stages, print_json, warn
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import Notice, counted
 from dashcalib_ros.fleet.batch import Camera, cameras_of, problems, shard_of
@@ -21,15 +21,14 @@ from dashcalib_ros.fleet.batch import batch as calibrate_fleet
 from dashcalib_ros.fleet.clips import ClipResult
 from dashcalib_ros.fleet.engine import Engine, LocalEngine, RayEngine
 from dashcalib_ros.fleet.manifest import Row, read_manifest
-from dashcalib_ros.fleet.overview import duration
+from dashcalib_ros.fleet.overview import LEVELS, duration
 from dashcalib_ros.fleet.storage import joined, masked, remove, write
 from dashcalib_ros.report.tables import line
-from dashcalib_ros.standard_streams import write_stderr, write_stdout
+from dashcalib_ros.standard_streams import write_stderr
 from dashcalib_ros.workers.child import ChildWorker
 
 # problems that are shown; the table has all
 SHOWN = 10
-LEVELS = ('accepted', 'weak', 'refused')
 
 
 def batch(args: argparse.Namespace) -> int:
@@ -62,7 +61,7 @@ def batch(args: argparse.Namespace) -> int:
     if files:
         progress.screen.show(line(f'written to {out}: ' + ', '.join(files)))
     if args.json:
-        write_stdout(json.dumps(_as_dict(cameras, files), indent=2, allow_nan=False))
+        print_json(_as_dict(cameras, files))
     return _summarise(cameras, progress.screen)
 
 
@@ -78,7 +77,6 @@ def _engine(args: argparse.Namespace, config: Config) -> Engine:
 
 
 def _summarise(cameras: Sequence[Camera], screen: Screen) -> int:
-    """Show what came of the cameras; return the exit code."""
     found = list(problems(cameras))
     warn(_problem(row, why) for row, why in found[:SHOWN])
     if len(found) > SHOWN:
@@ -92,7 +90,6 @@ def _summarise(cameras: Sequence[Camera], screen: Screen) -> int:
 
 
 def _as_dict(cameras: Sequence[Camera], files: Sequence[str]) -> dict[str, Any]:
-    """Return what --json prints: verdicts by camera, clips that could not be read, and files."""
     return {'cameras': {camera.name: camera.verdict for camera in cameras if camera.name},
             'not_read': [{'row': row.number, 'clip': row.clip, 'why': why}
                          for row, why in problems(cameras)],
@@ -106,8 +103,6 @@ def _problem(row: Row, why: str) -> str:
 
 @dataclass
 class _Progress:
-    """Shows the rate, the time left, and each camera as soon as it is solved."""
-
     clips: int
     screen: Screen
     stages: Stages
@@ -117,7 +112,6 @@ class _Progress:
     video_s: float = 0.0
 
     def tell(self, camera: Camera, clip: ClipResult | None) -> None:
-        """Count a clip that is done, or show a camera that is solved."""
         if clip is None:
             if camera.own is None or not camera.own.again:
                 self.screen.show(line(f'{camera.name}: {camera.verdict}'))
@@ -138,7 +132,6 @@ class _Progress:
         self.stages.show('clips', self.done / max(self.clips, 1), note)
 
     def effort_json(self, engine: Engine) -> bytes:
-        """Return the time and memory that the run took, to plan larger ones."""
         gather_s = engine.cpu_s['gather_clip']
         return (json.dumps({
             'wall_s': time.monotonic() - self.started, 'clips_read': self.read,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +10,7 @@ from rich.console import Group
 
 from dashcalib_ros.arrays import plain_values
 from dashcalib_ros.cli.arguments import ACCEPTED, UsageError
-from dashcalib_ros.cli.terminal import show, warn
+from dashcalib_ros.cli.terminal import print_json, show, warn
 from dashcalib_ros.errors import Notice
 from dashcalib_ros.formats import export as exported
 from dashcalib_ros.formats import load_calibration, load_camera
@@ -36,7 +35,7 @@ def compare(args: argparse.Namespace) -> int:
     if args.html is not None:
         write_text(args.html, difference_html(found))
     if args.json:
-        write_stdout(json.dumps(found.to_dict(), indent=2, allow_nan=False))
+        print_json(found.to_dict())
     else:
         show(comparison(found))
         if args.html is not None:
@@ -45,14 +44,13 @@ def compare(args: argparse.Namespace) -> int:
 
 
 def _rig(args: argparse.Namespace) -> int:
-    """Show how the cameras A and B of one car are turned against each other."""
     if args.html is not None:
         raise UsageError('E-RIG-HTML', '--html maps the difference of two calibrations of one '
                                        'camera; omit it with --rig')
     a, b = load_calibration(args.a), load_calibration(args.b)
     found = rig_of(a, b)
     if args.json:
-        write_stdout(json.dumps(plain_values(found) | {'agrees': found.agrees}, indent=2))
+        print_json(plain_values(found) | {'agrees': found.agrees})
         return ACCEPTED
     for side, path, calibration in (('A', args.a, a), ('B', args.b, b)):
         if calibration.mount is not None:
@@ -76,7 +74,7 @@ def export(args: argparse.Namespace) -> int:
         readout_ms = readout_ms and readout_ms * camera.image_size[1] / whole.image_size[1]
     keeps = EXPORTS[args.to].keeps if args.to in EXPORTS else ()
     if found.field is not None and 'field' in keeps and camera is not found.camera:
-        raise UsageError('E-FIELD-OF-PART', 'the field over the picture is known for the whole '
+        raise UsageError('E-FIELD-OF-PART', 'the residual distortion is known for the whole '
                          'picture only; omit --size and --crop')
     if args.out is not None:
         check_suffix(args.out, args.to)
@@ -92,7 +90,7 @@ def export(args: argparse.Namespace) -> int:
         others = ', '.join(kind for kind, form in EXPORTS.items() if 'field' in form.keeps)
         warn([Notice(
             'E-EXPORT-FIELD-LOST',
-            f'{found.name} has a field over the picture, for which {args.to} has no place: '
+            f'{found.name} has residual distortion, for which {args.to} has no place: '
             f'without it pixels are off by {np.sqrt(np.mean(lost**2)):.2f} px RMS and '
             f'{lost.max():.2f} px at the worst (of {size_text(found.image_size)}); export to '
             f'{others} to keep it')])

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Sequence
 
 from dashcalib_ros.cli.arguments import ACCEPTED, NOT_ENOUGH, WRONG, UsageError
 from dashcalib_ros.cli.drive import open_drive, read_config
-from dashcalib_ros.cli.terminal import Stages, show, warn
+from dashcalib_ros.cli.terminal import Stages, print_json, show, warn
 from dashcalib_ros.errors import InputError, counted
 from dashcalib_ros.formats.load import load_with_faults
 from dashcalib_ros.input.inputs import fits_bag
@@ -65,8 +64,7 @@ def check(args: argparse.Namespace) -> int:
           *(track.warnings if track else ())))
     now, before = calibration.mount, named.mount
     if args.json:
-        write_stdout(json.dumps(answer_dict(found, changes, motion, mount_dict(now, before)),
-                                indent=2, allow_nan=False))
+        print_json(answer_dict(found, changes, motion, mount_dict(now, before)))
     else:
         _show(found, motion, changes)
         if now is not None and before is not None:

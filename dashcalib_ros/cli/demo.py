@@ -22,7 +22,7 @@ from dashcalib_ros.cli.arguments import ACCEPTED, NOT_ENOUGH, exit_code
 from dashcalib_ros.cli.drive import read_config
 from dashcalib_ros.cli.rig import rig_lines, write_rig
 from dashcalib_ros.cli.run import files_line, now, warn_of
-from dashcalib_ros.cli.terminal import Screen, Stages
+from dashcalib_ros.cli.terminal import Screen, Stages, print_json
 from dashcalib_ros.config import Config
 from dashcalib_ros.demo import (
     DEMOS,
@@ -85,9 +85,8 @@ def demo(args: argparse.Namespace) -> int:
     warn_of(calibration, written)
     found = None if calibration.camera is None else mapping_error(calibration, drive)
     if args.json:
-        write_stdout(json.dumps(plain_values({
-            **result_dict(calibration), 'truth': truth,
-            'mapping_px': None if found is None else found.rms}), indent=2, allow_nan=False))
+        print_json(plain_values({**result_dict(calibration), 'truth': truth,
+                                 'mapping_px': None if found is None else found.rms}))
     names = [TRUTH, *[TRUE_RAYS] * bent, *['bag'] * args.keep_bag]
     screen.show(
         conclusion(calibration.verdict), summary(calibration),
@@ -99,7 +98,6 @@ def demo(args: argparse.Namespace) -> int:
 
 
 def _rig(args: argparse.Namespace, config: Config, started: float) -> int:
-    """Render several cameras of one car, place them, compare with the truth."""
     drives = rig_drives(seed=config.seed)
     base, screen = next(iter(drives)), Screen(args.quiet, to_stderr=args.json)
     truth = {name: each.values for name, each in true_places(drives, base).items()}
@@ -150,7 +148,6 @@ def mapping_error(calibration: Calibration, drive: Drive, with_field: bool = Tru
 
 def _compared(calibration: Calibration, drive: Drive, lens: NamedCamera, found: Apart | None
               ) -> Iterator[RenderableType]:
-    """Yield the estimate beside the truth."""
     if calibration.camera is None:
         yield line('no estimate to compare with the truth')
         return
@@ -178,7 +175,6 @@ def _compared(calibration: Calibration, drive: Drive, lens: NamedCamera, found: 
 
 
 def _true_rays(drive: Drive) -> bytes:
-    """Return an .npz with the true viewing ray of each pixel, as `export --to rays` has them."""
     width, height = drive.lens.size
     pixels = np.stack(np.meshgrid(np.arange(float(width)), np.arange(float(height))), -1)
     rays = drive.lens.rays(pixels.reshape(-1, 2)).reshape(height, width, 3)

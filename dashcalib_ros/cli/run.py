@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime, timezone
@@ -15,7 +14,7 @@ from rich.text import Text
 from dashcalib_ros.arrays import plain_values
 from dashcalib_ros.cli.arguments import ACCEPTED, exit_code
 from dashcalib_ros.cli.drive import open_drive, read_config
-from dashcalib_ros.cli.terminal import Screen, Stages, show, warn
+from dashcalib_ros.cli.terminal import Screen, Stages, print_json, show, warn
 from dashcalib_ros.errors import InputError, Notice, counted, spared
 from dashcalib_ros.formats import result_json
 from dashcalib_ros.formats.ours import codes_of
@@ -29,7 +28,7 @@ from dashcalib_ros.report.tables import (
     next_step,
     summary,
 )
-from dashcalib_ros.report.wording import cures, objections, optional
+from dashcalib_ros.report.wording import cures, optional
 from dashcalib_ros.session import calibrate_drive, outlook_of
 from dashcalib_ros.standard_streams import write_stdout
 
@@ -129,7 +128,7 @@ def turns(args: argparse.Namespace) -> int:
     warn(warnings)
     yaws = found.yaws_deg
     if args.json:
-        write_stdout(json.dumps(plain_values({
+        print_json(plain_values({
             'input': drive.source.name, 'frames': found.frames,
             'turns': [{'center': turn.center, 'first': turn.first, 'last': turn.last,
                        'stamp': turn.stamp_s, 'prominence': turn.prominence,
@@ -137,8 +136,7 @@ def turns(args: argparse.Namespace) -> int:
                       for turn in found.turns],
             'yaw_deg': sum(yaws.values()), 'verdict_at_best': found.verdict.level,
             'reasons': found.verdict.reasons, 'reason_codes': found.verdict.codes,
-            'warnings': warnings, 'warning_codes': codes_of(warnings)}), indent=2,
-            allow_nan=False))
+            'warnings': warnings, 'warning_codes': codes_of(warnings)}))
         return ACCEPTED
     if found.turns:
         show(TextTable(COLUMNS, [
@@ -151,7 +149,6 @@ def turns(args: argparse.Namespace) -> int:
 
 
 def _enough(found: Outlook) -> tuple[str, str]:
-    """Return whether the turns are enough, with their degrees, and what to do next."""
     yaws, verdict = found.yaws_deg.values(), found.verdict
     text = f'{counted(len(found.turns), "turn")} found in {counted(found.frames, "frame")}'
     if yaws:
@@ -159,7 +156,7 @@ def _enough(found: Outlook) -> tuple[str, str]:
                  f'sharpest of {max(yaws):.0f}°')
     if not verdict.accepted:
         return (f'{text}: not enough, the result would be {verdict.level}: '
-                f'{"; ".join(what for _, what, _ in objections(verdict)[:len(verdict.told)])}',
+                f'{"; ".join(each.what for each in verdict.told)}',
                 f'next: {cures(verdict)[0]}')
     gentle = '' if max(yaws) >= SHARP_DEG else ', but without a sharp turn it may be weak'
     return f'{text}: enough for a calibration{gentle}', 'next: dashcalib run with the same INPUT'

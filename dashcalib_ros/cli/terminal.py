@@ -6,12 +6,14 @@ No colours are used if NO_COLOR is set.
 from __future__ import annotations
 
 import io
+import json
 import signal
 import sys
 import time
 from collections.abc import Iterable
 from contextlib import AbstractContextManager
 from types import TracebackType
+from typing import Any
 
 from rich.console import Console, Group, RenderableType
 from rich.progress import (
@@ -48,6 +50,11 @@ def show(renderable: RenderableType, to_stderr: bool = False) -> None:
     console.print(renderable)
     plain = '\n'.join(line.rstrip() for line in text.getvalue().splitlines())
     (write_stderr if to_stderr else write_stdout)(plain, styled=bool(terminal))
+
+
+def print_json(values: Any) -> None:
+    """Print plain values on stdout. Raises OutputError where it is closed or full."""
+    write_stdout(json.dumps(values, indent=2, allow_nan=False))
 
 
 class Screen:

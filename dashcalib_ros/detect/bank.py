@@ -12,14 +12,11 @@ from dashcalib_ros.input import Frame
 
 @dataclass
 class _Held:
-    """A turn, and the peak that knows its prominence. reported: new_turns() has returned it."""
-
     turn: Turn
     peak: Peak
     reported: bool = False
 
     def present(self) -> Turn:
-        """Return the turn with its prominence so far."""
         return replace(self.turn, prominence=self.peak.prominence)
 
     def exchange(self, frames: tuple[Frame, ...]) -> None:

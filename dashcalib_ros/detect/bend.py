@@ -77,7 +77,6 @@ class _Measured:
 
     @property
     def along(self) -> Floats:
-        """Return the derivative by k1 (n, k)."""
         return np.asarray(self.derivatives[:, :, K1])
 
 
@@ -216,7 +215,6 @@ def _groups(stamps_s: Floats, group_s: float) -> Ints:
 
 
 def _rms(values: Floats) -> Floats:
-    """Return the root mean square (n,) of the rows of values (n, k)."""
     return np.asarray(np.sqrt(np.mean(values**2, axis=1)))
 
 
@@ -234,7 +232,6 @@ def _location(wanted: Floats, information: Floats) -> tuple[float, Floats]:
 
 
 def _sigma(wanted: Floats, information: Floats, group: Ints, groups: int) -> float:
-    """Return the standard deviation by leaving out each group of images in turn."""
     sigma = jackknife(lambda kept: np.array(_location(wanted[kept], information[kept])[0]),
                       group, groups)
     # of few groups it is uncertain itself: the wider t distribution, for as many

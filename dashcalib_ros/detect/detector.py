@@ -117,7 +117,6 @@ class TurnDetector:
         return self._history.table()
 
     def _begin(self) -> None:
-        """Begin a stretch without gaps."""
         self._median = StreamingMedian(self.config.half_width)
         self._peaks = PeakFinder(MIN_PROMINENCE, 2 * self._half_ns)
         self._filtered_ns: int | None = None
@@ -126,7 +125,6 @@ class TurnDetector:
         self._candidates: list[_Candidate] = []
 
     def _end(self) -> None:
-        """End a stretch: all of its turns are known."""
         for stamp_ns, median in self._median.finish():
             self._filtered(stamp_ns, median)
         if self._filtered_ns is not None:
@@ -137,7 +135,6 @@ class TurnDetector:
         self._begin()
 
     def _filtered(self, stamp_ns: int, value: float) -> None:
-        """Take the next sample of the filtered signal."""
         if self._filtered_ns is None:
             self._find(stamp_ns, self._beyond(value))
         self._filtered_ns, self.magnitude = stamp_ns, value
@@ -166,7 +163,6 @@ class TurnDetector:
         return second.stamp_ns - first.stamp_ns <= self._reach_ns
 
     def _drop_impossible(self) -> None:
-        """Drop the candidates that ended below the least prominence."""
         self._candidates = [each for each in self._candidates
                             if each.peak.limit >= MIN_PROMINENCE]
 

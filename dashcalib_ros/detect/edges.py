@@ -97,7 +97,6 @@ class _Traced:
 
 
 def _traced(peak: Mask, shortest: float) -> _Traced:
-    """Return the long edges without branches; peak: (h, w)."""
     _, labels = cv2.connectedComponents(peak.view(np.uint8), connectivity=8)
     places = np.flatnonzero(peak)
     pixels = np.bincount(label := np.asarray(labels, np.int32).ravel()[places])
@@ -116,7 +115,6 @@ def _traced(peak: Mask, shortest: float) -> _Traced:
 
 
 def _extent(place: Ints, edge: Ints, count: int) -> tuple[Ints, Ints]:
-    """Return the smallest and the largest place (m,) of each edge, (count,)."""
     low, high = np.full(count, np.iinfo(np.int64).max), np.zeros(count, np.int64)
     np.minimum.at(low, edge, place)
     np.maximum.at(high, edge, place)
@@ -150,12 +148,11 @@ def _smooth(across: Floats) -> Mask:
 
 
 def _longest_edges(image: GreyImage) -> Floats32:
-    """Return the points (n, KNOTS, 2) of at most MOST edges."""
     points = upright_edges(image)
     height = points[:, -1, 1] - points[:, 0, 1]
     return points[np.sort(np.argsort(-height, kind='stable')[:MOST])]
 
-# pictures that are searched at the most; of more, every second one is dropped
+# pictures that are searched at most; of more, every second one is dropped
 IMAGES = 300
 
 
@@ -163,7 +160,7 @@ class LineCollector:
     """Searches a picture every period; keeps points of edges only, never a picture."""
 
     def __init__(self, images: int = IMAGES, beside: bool = False) -> None:
-        """images: that are searched at the most. beside: a thread searches until the next one."""
+        """images: that are searched at most. beside: a thread searches until the next one."""
         self._thread = ThreadPoolExecutor(1) if beside else None
         # what returns the points, once they are found
         self._found: EvenlySpaced[Callable[[], Floats32]] = EvenlySpaced(PERIOD_S, images)

@@ -20,7 +20,7 @@ from dashcalib_ros.arrays import Floats, Floats32
 MIN_POINTS = 30
 # a fundamental matrix with a smaller share of inliers fits by chance, or one moving car
 MIN_INLIERS = 0.4
-# samples drawn at the most: limits the time for a pair of images
+# samples drawn at most: limits the time for a pair of images
 ITERATIONS = 300
 # as exact as MAGSAC and RANSAC on images 0.3 s apart
 METHOD = cv2.USAC_FAST

@@ -94,8 +94,6 @@ class _Seen:
 
 @dataclass(frozen=True)
 class _Triplet:
-    """Three processed images, a spacing apart."""
-
     first: _Seen
     middle: _Seen
     last: _Seen
@@ -212,7 +210,6 @@ class MotionEstimator:
             f'time: check that all images are of one camera and that none is missing'),)))
 
     def _reset(self) -> None:
-        """Drop all points: the next image does not continue the last one."""
         keep = math.ceil(2 * SPACING_S * self.config.rate / (1 - EARLY)) + 3
         self._seen: deque[_Seen] = deque(maxlen=keep)
         self._pairs: dict[tuple[int, int], Floats | None] = {}
@@ -224,7 +221,6 @@ class MotionEstimator:
         self._perhaps_gap = False
 
     def _start(self, shape: tuple[int, ...]) -> None:
-        """Begin with images of this shape."""
         check_mask(self._user, (shape[1], shape[0]))
         self._reset()
         self._shape = (shape[0], shape[1])
@@ -238,7 +234,6 @@ class MotionEstimator:
         self._exclude(self._user)
 
     def _exclude(self, valid: Mask | None) -> None:
-        """Track only where the full image is valid."""
         self._valid = None
         if valid is not None:
             small = cv2.resize(valid.astype(np.uint8), self._size, interpolation=cv2.INTER_NEAREST)
@@ -278,13 +273,11 @@ class MotionEstimator:
         return _Seen(frame.index, frame.stamp_ns, self._ids, self._xy, followed), lost
 
     def _is_late(self, frame: Frame) -> bool:
-        """Return whether more time than usual has passed since the last image."""
         stamps = [seen.stamp_ns for seen in self._seen]
         return (len(stamps) < 2 or frame.stamp_ns - stamps[-1]
                 > USUAL_STEP * float(np.median(np.diff(stamps))))
 
     def _compare_between(self, before: Floats32, now: Floats32) -> None:
-        """Compare a skipped image with those around it; before, now: (n, 2) px in these."""
         if self._last is not None and self._between is not None:
             self.one_camera.look((self._last, self._between), before, now, self._tracking)
         self._between = None
@@ -373,7 +366,6 @@ class MotionEstimator:
         self._born += len(corners)
 
     def _triplet(self) -> _Triplet | None:
-        """Return the triplet that ends with the newest image; None before there is one."""
         last = self._seen[-1]
         middle = self._earlier(last)
         first = self._earlier(middle) if middle else None

@@ -186,7 +186,6 @@ class EgoMask:
         return result
 
     def _pool(self, values: npt.NDArray[Any]) -> Floats:
-        """Sum (height, width) over the cells."""
         rows, columns = self.grid
         height, width = values.shape
         padded = np.zeros((rows * self._cell, columns * self._cell))

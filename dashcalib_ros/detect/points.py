@@ -140,7 +140,6 @@ def _corner_strength(image: GreyImage) -> Floats32:
 
 
 def _square(reach: int) -> GreyImage:
-    """Return the neighbourhood of a pixel so far to each side."""
     return np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
 
 

@@ -162,7 +162,6 @@ def _opened(path: str, classes: str) -> SegmentationModel:
 
 
 def _session(path: str) -> Any:
-    """Return an onnxruntime session; raises ConfigError."""
     file = Path(path)
     with suppress(RuntimeError):  # ~user of an unknown user: the path stays as it is
         file = file.expanduser()
@@ -193,5 +192,4 @@ def _session(path: str) -> Any:
 
 
 def _open(side: Any) -> bool:
-    """Return whether a dimension may have any size."""
     return not isinstance(side, int) or side <= 0

@@ -16,11 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from dashcalib_ros.config import Config
-from dashcalib_ros.errors import ConfigError, InputError, coded
-from dashcalib_ros.fleet import lens_prior, overview, solved, tables
+from dashcalib_ros.errors import ConfigError, InputError
+from dashcalib_ros.fleet import lens_prior, overview, solved, storage, tables
 from dashcalib_ros.fleet.clips import (
     GONE,
-    LONGEST,
     ClipResult,
     gather_clip,
     gathered,
@@ -31,17 +30,6 @@ from dashcalib_ros.fleet.clips import (
 from dashcalib_ros.fleet.engine import DiedError, Engine, Task
 from dashcalib_ros.fleet.fuse import fuse
 from dashcalib_ros.fleet.manifest import Row
-from dashcalib_ros.fleet.storage import (
-    is_folder,
-    is_url,
-    joined,
-    listed,
-    masked,
-    read,
-    remove,
-    stamp,
-    write,
-)
 from dashcalib_ros.judge.conclude import versions
 from dashcalib_ros.report import Written, write_results
 from dashcalib_ros.report.files import REPORT
@@ -152,14 +140,14 @@ def _gather_and_solve(cameras: Sequence[Camera], out: str, config: Config, engin
         if isinstance(outcome, DiedError):
             outcome = set_aside(row, out, config)
         elif isinstance(outcome, Exception):
-            outcome = ClipResult(coded(outcome, LONGEST))
+            outcome = ClipResult.without(outcome)
         camera.results[row.number] = outcome
         tell(camera, outcome)
         if len(camera.results) == len(camera.rows):
             camera.clips = tables.clip_rows(camera.name, camera.make, camera.gathered, {})
             # where it has files of earlier, they must not stay as they are
-            if (all(result.problem == GONE for _, result in camera.gathered)
-                    and not stamp(joined(out, tables.camera_folder(camera.name)))):
+            if (all(result.code == GONE.code for _, result in camera.gathered)
+                    and not storage.stamp(storage.joined(out, tables.camera_folder(camera.name)))):
                 _failed(camera, InputError('E-CLIPS-MISSING',
                                            'none of its clips exists; check the paths'))
                 tell(camera, None)
@@ -171,7 +159,7 @@ def _gather_and_solve(cameras: Sequence[Camera], out: str, config: Config, engin
 
 def _failed(camera: Camera, error: Exception) -> None:
     camera.own, camera.verdict = None, 'refused'
-    camera.row = tables.failed_row(camera.name, camera.make, camera.clips, coded(error, LONGEST))
+    camera.row = tables.failed_row(camera.name, camera.make, camera.clips, error)
 
 
 def _publish(cameras: Sequence[Camera], found: Mapping[str, lens_prior.ModelPrior], out: str,
@@ -193,8 +181,8 @@ def _write_tables(cameras: Sequence[Camera], out: str) -> tuple[str, ...]:
                        key=lambda row: int(row['row']))
     files = [*tables.write_table(out, 'cameras', camera_rows, tables.CAMERA_COLUMNS),
              *tables.write_table(out, 'clips', clip_rows, tables.CLIP_COLUMNS)]
-    write(joined(out, overview.NAME), overview.overview_html(camera_rows, clip_rows).encode(
-        'utf-8', 'replace'))
+    page = overview.overview_html(camera_rows, clip_rows)
+    storage.write(storage.joined(out, overview.NAME), page.encode('utf-8', 'replace'))
     return (*files, overview.NAME)
 
 
@@ -222,7 +210,7 @@ def solve_camera(camera: str, make: str, clips: Sequence[tuple[Row, ClipResult]]
     used = {row.name: (result.file, f'{result.content}{row.topic or ""}')
             for row, result in reversed(clips) if result.file}
     name = solved_file(camera, make, [(clip, *used[clip]) for clip in sorted(used)], config)
-    data = read(joined(out, name))
+    data = storage.read(storage.joined(out, name))
     again = data is not None
     if data is None:
         loaded = {}
@@ -235,7 +223,7 @@ def solve_camera(camera: str, make: str, clips: Sequence[tuple[Row, ClipResult]]
             # what was read has this content, whatever it says
             loaded[clip] = replace(found, content=content)
         data = solved.encoded(fuse(camera, make, loaded, config))
-        write(joined(out, name), data)
+        storage.write(storage.joined(out, name), data)
     result = solved.decoded(data, name)
     return CameraResult(name, result.calibration.verdict.level, result.shares,
                         solved.unit_of(result), again)
@@ -259,7 +247,7 @@ def publish_camera(name: str, found: lens_prior.ModelPrior | None,
 
     name: the file of its own result. found: the prior of its model. clips: the rows of its clips.
     """
-    data = read(joined(out, name))
+    data = storage.read(storage.joined(out, name))
     if data is None:
         raise InputError('E-FLEET-FILE-CHANGED', f'{name} was removed while the fleet was solved; '
                                                  f'start the command again')
@@ -267,11 +255,11 @@ def publish_camera(name: str, found: lens_prior.ModelPrior | None,
     final = solved.final_of(result, found)
     yaml_name = re.sub(r'[^A-Za-z0-9_]+', '_', result.camera).strip('_') or 'camera'
     yaml_name = 'camera_narrow_stereo' if yaml_name == 'narrow_stereo' else yaml_name
-    place = joined(out, tables.camera_folder(result.camera))
-    if is_url(place):
+    place = storage.joined(out, tables.camera_folder(result.camera))
+    if storage.is_url(place):
         with temporary_folder() as scratch:
             lost = _exchanged(place, scratch, lambda: write_results(
-                final.calibration, scratch, yaml_name, place=masked(place))).lost
+                final.calibration, scratch, yaml_name, place=storage.masked(place))).lost
     else:
         lost = write_results(final.calibration, place, yaml_name).lost
     row = tables.camera_row(result, final, clips)
@@ -280,14 +268,14 @@ def publish_camera(name: str, found: lens_prior.ModelPrior | None,
 
 def _exchanged(place: str, scratch: Path, change: Callable[[], Written]) -> Written:
     """Change the calibrations of a store's folder in a folder of this machine."""
-    there = listed(place) if is_folder(place) else []
+    there = storage.listed(place) if storage.is_folder(place) else []
     for name in (each.rpartition('/')[2] for each in there):
         if name.startswith(('calibration.', REPORT)):
-            (scratch / name).write_bytes(read(joined(place, name)) or b'')
+            (scratch / name).write_bytes(storage.read(storage.joined(place, name)) or b'')
     before = {path.name for path in scratch.iterdir()}
     written = change()
     for path in sorted(scratch.iterdir(), key=lambda path: path.name == REPORT):
-        write(joined(place, path.name), path.read_bytes())
+        storage.write(storage.joined(place, path.name), path.read_bytes())
     for name in sorted(before - {path.name for path in scratch.iterdir()}):
-        remove(joined(place, name))
+        storage.remove(storage.joined(place, name))
     return written

@@ -9,7 +9,7 @@ import hashlib
 import json
 import os
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from dashcalib_ros.config import Config
@@ -22,41 +22,25 @@ from dashcalib_ros.errors import (
     Notice,
     OutputError,
     WorkerError,
+    code_of,
     coded,
     one_line,
 )
+from dashcalib_ros.fleet import storage
 from dashcalib_ros.fleet.manifest import Row
-from dashcalib_ros.fleet.storage import (
-    clip_files,
-    is_url,
-    joined,
-    local_copy,
-    masked,
-    read,
-    stamp,
-    write,
-)
 from dashcalib_ros.input.inputs import open_frames
 from dashcalib_ros.limits import read_file
 from dashcalib_ros.reconstruct import reconstruct
 from dashcalib_ros.solve.evidence import SHARP_DEG
-from dashcalib_ros.store.scene_file import (
-    FORMAT,
-    LARGEST,
-    SUFFIX,
-    Origin,
-    SceneFile,
-    StoredTurn,
-    decoded,
-    encoded,
-)
+from dashcalib_ros.store import scene_file
+from dashcalib_ros.store.scene_file import Origin, SceneFile, StoredTurn
 from dashcalib_ros.whole_files import FULL
 from dashcalib_ros.workers.memory import in_a_file
 
 # settings by which a clip's scenes do not change
 LATER = ('intrinsics.', 'verdict.', 'fleet.', 'known.')
 LATER_NAMES = ('threads', 'rectified', 'turns.store')
-GONE = coded(InputError('E-CLIP-MISSING', 'there is no such file; check the path'))
+GONE = InputError('E-CLIP-MISSING', 'there is no such file; check the path')
 # what is gathered of a clip; 2: its upright lines, too; 3: other stretches than turns
 GATHERED = 3
 # characters of an error in a table, without its code
@@ -69,12 +53,13 @@ BLOCK = 2**20
 class ClipResult:
     """What became of a clip, with columns of the table of clips.
 
-    problem: why there are no gathered turns, '' if there are: in file. stamp: as storage.stamp()
-    before the clip was read; '' for what is tried again the next time. time: of the first turn, s;
-    only a date if the clip has dates. again: this was known before.
+    problem: why there are no gathered turns, '' if there are: in file. code: of that. stamp: as
+    storage.stamp() before the clip was read; '' for what is tried again the next time. time: of
+    the first turn, s; only a date if the clip has dates. again: this was known before.
     """
 
     problem: str = ''
+    code: str = ''
     stamp: str = ''
     file: str | None = None
     content: str | None = None
@@ -88,6 +73,11 @@ class ClipResult:
     warnings: tuple[str, ...] = ()
     again: bool = False
 
+    @classmethod
+    def without(cls, why: Exception | str, stamp: str = '') -> ClipResult:
+        """Return the result of a clip that gives no turns."""
+        return cls(coded(why, LONGEST), code_of(why), stamp)
+
 
 def looked_at(row: Row, out: str, config: Config) -> ClipResult | None:
     """Return what became of a clip that no worker need read; None where one must.
@@ -95,10 +85,11 @@ def looked_at(row: Row, out: str, config: Config) -> ClipResult | None:
     A file of this machine that has gone, or never was, costs two looks and no task.
     """
     if row.problem:
-        return ClipResult(coded(Notice('E-MANIFEST-ROW', row.problem)), again=True)
-    if is_url(row.place) or os.path.lexists(row.place) or read(clip_file(row, out, config)):
+        return replace(ClipResult.without(Notice('E-MANIFEST-ROW', row.problem)), again=True)
+    if (storage.is_url(row.place) or os.path.lexists(row.place)
+            or storage.read(clip_file(row, out, config))):
         return None
-    return ClipResult(GONE)
+    return ClipResult.without(GONE)
 
 
 def gather_clip(row: Row, out: str, config: Config) -> ClipResult:
@@ -109,22 +100,22 @@ def gather_clip(row: Row, out: str, config: Config) -> ClipResult:
     name, now = clip_file(row, out, config), ''
     try:
         # before it is read: what changes later is read again
-        now = stamp(row.place) or ''
+        now = storage.stamp(row.place) or ''
         return _earlier(name, out, now) or _noted(name, _gathered(row, out, config, now))
     except InputError as error:
-        return _noted(name, ClipResult(coded(error, LONGEST), now))
+        return _noted(name, ClipResult.without(error, now))
     except OutputError:
         raise
     except DashcalibError as error:  # not the clip's own fault
-        return ClipResult(coded(error, LONGEST))
+        return ClipResult.without(error)
     except OSError as error:
         if error.errno in FULL:
             raise OutputError('E-SCRATCH-FULL',
                               f'no space is left for the copy of a clip ({one_line(error)}); free '
                               f'some, or set TMPDIR to another disk, and start the command again: '
                               f'it continues where it stopped') from error
-        return ClipResult(coded(Notice('E-FILE-ACCESS',
-                                       f'this machine cannot read it: {one_line(error)}')))
+        return ClipResult.without(
+            Notice('E-FILE-ACCESS', f'this machine cannot read it: {one_line(error)}'))
 
 
 def set_aside(row: Row, out: str, config: Config) -> ClipResult:
@@ -132,13 +123,14 @@ def set_aside(row: Row, out: str, config: Config) -> ClipResult:
     error = WorkerError('E-CLIP-SET-ASIDE',
                         f'its worker process died {config.fleet.attempts} times, and it is set '
                         f'aside; check that the clip is sound and that there is enough memory')
-    return _noted(clip_file(row, out, config), ClipResult(coded(error), stamp(row.place) or ''))
+    return _noted(clip_file(row, out, config),
+                  ClipResult.without(error, storage.stamp(row.place) or ''))
 
 
 def clip_file(row: Row, out: str, config: Config) -> str:
     """Return the place of the file about what became of a clip."""
-    key = hash_of([masked(row.place), settings_hash(config, row.fps, row.topic)])
-    return joined(out, f'clips/{key[:2]}/{key}.json')
+    key = hash_of([storage.masked(row.place), settings_hash(config, row.fps, row.topic)])
+    return storage.joined(out, f'clips/{key[:2]}/{key}.json')
 
 
 def hash_of(values: object) -> str:
@@ -152,32 +144,32 @@ def _earlier(name: str, out: str, now: str) -> ClipResult | None:
     A clip that changed since is read again. One that is gone is not needed any more.
     """
     try:
-        values = json.loads(read(name) or b'')
-        result = ClipResult(**{**values, 'warnings': tuple(values['warnings']), 'again': True})
+        values = json.loads(storage.read(name) or b'')
+        result = ClipResult(**{**values, 'code': values['code'], 'again': True,
+                               'warnings': tuple(values['warnings'])})
     except (ValueError, KeyError, TypeError):
         return None
     holds = now == result.stamp or (result.file and not now)
-    there = not result.file or stamp(joined(out, result.file))
+    there = not result.file or storage.stamp(storage.joined(out, result.file))
     return result if holds and there else None
 
 
 def _noted(name: str, result: ClipResult) -> ClipResult:
     if result.stamp:
-        write(name, json.dumps(asdict(result), sort_keys=True).encode())
+        storage.write(name, json.dumps(asdict(result), sort_keys=True).encode())
     return result
 
 
 def _gathered(row: Row, out: str, config: Config, now: str) -> ClipResult:
-    """Write a clip's turns to their file. Raises DashcalibError, OSError."""
     if not now:
-        return ClipResult(GONE)
-    with local_copy(row.place) as path:
+        return ClipResult.without(GONE)
+    with storage.local_copy(row.place) as path:
         try:
             content = content_hash(path)
             # turns that were gathered elsewhere have whatever settings
-            given = path.suffix == SUFFIX
+            given = path.suffix == scene_file.SUFFIX
             of = content if given else f'{content}-{settings_hash(config, row.fps, row.topic)}'
-            name = f'gathered/{of[:2]}/{of}{SUFFIX}'
+            name = f'gathered/{of[:2]}/{of}{scene_file.SUFFIX}'
             found = gathered(out, name)
             if found is None:
                 found = _given(path) if given else gather(path, content, row.fps, row.topic,
@@ -186,29 +178,28 @@ def _gathered(row: Row, out: str, config: Config, now: str) -> ClipResult:
                     raise InputError('E-CLIP-CHANGED',
                                      f'{path} changed while it was read: start the command again '
                                      f'when the clip is complete')
-                write(joined(out, name), encoded(found))
+                storage.write(storage.joined(out, name), scene_file.encoded(found))
         except InputError as error:
             # the tables must not depend on where the clip, or its copy, lies
             raise InputError(error.code, str(error).replace(str(path), row.clip)) from error
     width, height = found.origin.image_size
-    return ClipResult('', now, name, content, width, height, found.frames, found.seconds,
+    return ClipResult('', '', now, name, content, width, height, found.frames, found.seconds,
                       found.found, len(found.turns),
                       found.turns[0].stamp_s if found.turns else None, found.warnings)
 
 
 def gathered(out: str, name: str) -> SceneFile | None:
     """Return turns that were gathered before; None where there are none, or they are damaged."""
-    data = read(joined(out, name))
+    data = storage.read(storage.joined(out, name))
     try:
-        return None if data is None else decoded(data)
+        return None if data is None else scene_file.decoded(data)
     except ValueError:
         return None
 
 
 def _given(path: Path) -> SceneFile:
-    """Return turns that were gathered elsewhere; raises InputError."""
     try:
-        return decoded(read_file(path, LARGEST))
+        return scene_file.decoded(read_file(path, scene_file.LARGEST))
     except ValueError as error:
         raise InputError('E-GATHERED-DAMAGED',
                          f'{path.name} is not a file of gathered turns ({one_line(error)}); '
@@ -219,7 +210,7 @@ def settings_hash(config: Config, fps: float | None, topic: str | None) -> str:
     """Return a hash of all that a clip's scenes depend on beside its content."""
     used = {name: value for name, value in config.flat().items()
             if not name.startswith(LATER) and name not in LATER_NAMES}
-    return hash_of([FORMAT, GATHERED, used, fps, topic])[:16]
+    return hash_of([scene_file.FORMAT, GATHERED, used, fps, topic])[:16]
 
 
 def content_hash(path: Path) -> str:
@@ -229,7 +220,7 @@ def content_hash(path: Path) -> str:
     """
     found = hashlib.sha256()
     try:
-        for file, about in clip_files(path):
+        for file, about in storage.clip_files(path):
             if file != path:
                 found.update(os.fsencode(file.relative_to(path)) + b'\0')
                 found.update(about.st_size.to_bytes(8, 'big'))

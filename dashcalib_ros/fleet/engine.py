@@ -246,7 +246,6 @@ class RayEngine(Engine):
             return WorkerError('E-RAY-TASK-FAILED', one_line(error))
 
     def _node_was_lost(self) -> bool:
-        """Return whether a node of the cluster died since the last look."""
         dead = sum(not node['Alive'] for node in self._ray.nodes())
         more = dead > self._lost_nodes
         self._lost_nodes = dead

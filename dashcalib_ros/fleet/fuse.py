@@ -17,7 +17,7 @@ from dashcalib_ros.detect import Bend, Lines
 from dashcalib_ros.detect.bend import GROUP_S
 from dashcalib_ros.detect.straights import StraightCollector
 from dashcalib_ros.detect.turn import TurnId, is_turn
-from dashcalib_ros.errors import Notice, coded, counted, spared
+from dashcalib_ros.errors import Notice, counted, spared
 from dashcalib_ros.fleet.solved import ClipShare, Estimate, Solved
 from dashcalib_ros.input.source import size_text
 from dashcalib_ros.judge import Verdict
@@ -85,14 +85,13 @@ def _fused(camera: str, make: str, clips: Clips, config: Config) -> Solved:
     calibration = replace(conclude(solution, evidence, config), input_name=camera)
     if solution is None:
         why = _nothing_found(kept)
-        calibration = replace(calibration, verdict=Verdict('refused', (why,), codes=(why.code,)))
+        calibration = replace(calibration, verdict=Verdict('refused', (why,)))
     shares = dict.fromkeys(clips, ClipShare())
-    shares.update({turns[turn].clip: ClipShare(
-        left_out=coded(Notice('E-CLIP-REPEATED',
-                              f'shows the same pictures as {turns[other].clip}')))
+    shares.update({turns[turn].clip: ClipShare.without(
+        Notice('E-CLIP-REPEATED', f'shows the same pictures as {turns[other].clip}'))
         for turn, other in sorted(repeated.items(), reverse=True)})
     shares.update(own)
-    shares.update({name: ClipShare(left_out=coded(why)) for name, why in left_out.items()})
+    shares.update({name: ClipShare.without(why) for name, why in left_out.items()})
     return Solved(camera, make, calibration, _estimate(solution, origin, config, lines), shares)
 
 
@@ -118,7 +117,6 @@ def _estimate(solution: Solution | None, origin: Origin, config: Config, lines: 
 
 
 def _same_content(clips: Clips) -> dict[str, Notice]:
-    """Return the clips with the same content as another, which count once."""
     first: dict[str, str] = {}
     return {name: Notice('E-CLIP-REPEATED', f'has the same content as {first[clip.content]}')
             for name, clip in clips.items()
@@ -126,10 +124,7 @@ def _same_content(clips: Clips) -> dict[str, Notice]:
 
 
 def _other_origins(clips: Clips) -> dict[str, Notice]:
-    """Return the clips with another image size than most: a calibration holds for one.
-
-    Pictures that were resized differently, with other settings, are of another size, too.
-    """
+    """Return the clips of another image size than most, or that were resized differently."""
     def weight(origin: Origin) -> tuple[int, int, int, str]:
         turns = [len(clip.turns) for clip in clips.values() if clip.origin == origin]
         # clips count before turns: one clip with many does not decide
@@ -145,7 +140,6 @@ def _other_origins(clips: Clips) -> dict[str, Notice]:
 
 
 def _numbered(clips: Clips) -> dict[TurnId, ClipTurn]:
-    """Return every reconstructed turn, under an identity that is unique in the camera."""
     found: dict[TurnId, ClipTurn] = {}
     for name, clip in clips.items():
         for turn in clip.turns:
@@ -180,7 +174,6 @@ def _chosen(turns: Mapping[TurnId, ClipTurn], left_out: Mapping[str, Notice], co
 
 def _evidence(clips: Clips, origin: Origin, stored: Sequence[StoredTurn],
               left_out: Mapping[str, Notice]) -> Evidence:
-    """Return what the judge needs beside the solution, of clips without pictures."""
     return Evidence(
         image_size=origin.image_size, scale=origin.scale,
         frames=sum(clip.frames for clip in clips.values()), stored=tuple(stored),
@@ -246,7 +239,6 @@ OTHER_FOCAL, OTHER_FOCAL_SHARE = 4.0, 0.05
 
 
 def _other_focal(shares: Mapping[str, ClipShare]) -> dict[str, Notice]:
-    """Return the clips whose own fx is clearly off the median of all, each counted about once."""
     known = [(clip, share.fx, share.fx_sigma) for clip, share in sorted(shares.items())
              if share.fx and share.fx_sigma]
     if len(known) < 3:

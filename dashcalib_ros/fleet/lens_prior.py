@@ -150,8 +150,8 @@ def lens_prior(units: Sequence[Unit], config: FleetConfig) -> LensPrior | None:
     if len(units) < config.least_units:
         return None
     focal = np.array([unit.lens[0] for unit in units])
-    agree = _densest(focal, np.array([unit.covariance[0, 0] for unit in units]), config)
-    prior = _fitted([unit for unit, kept in zip(units, agree, strict=True) if kept], config)
+    agree = _densest(focal, np.array([unit.covariance[0, 0] for unit in units]))
+    prior = _fitted([unit for unit, kept in zip(units, agree, strict=True) if kept])
     for _ in range(ROUNDS):
         now = np.array([off_by(unit, prior) <= OTHER_MODE for unit in units])
         if now.sum() < config.least_units:
@@ -159,7 +159,7 @@ def lens_prior(units: Sequence[Unit], config: FleetConfig) -> LensPrior | None:
         if np.array_equal(now, agree):
             break
         agree = now
-        prior = _fitted([unit for unit, kept in zip(units, agree, strict=True) if kept], config)
+        prior = _fitted([unit for unit, kept in zip(units, agree, strict=True) if kept])
     return prior
 
 
@@ -169,7 +169,7 @@ CANDIDATES = 500
 FOCAL_SPREAD = 0.0125
 
 
-def _densest(focal: Floats, variance: Floats, config: FleetConfig) -> Mask:
+def _densest(focal: Floats, variance: Floats) -> Mask:
     """Return (n,) the units around the value that most others agree with: the make's main mode.
 
     focal: (n,) curvatures; variance: (n,) of each. A unit that knows little counts little.
@@ -196,8 +196,7 @@ SPREAD_UNITS = 20.0
 ONE_TURN_EXCESS = 3.0
 
 
-def _fitted(units: Sequence[Unit], config: FleetConfig) -> LensPrior:
-    """Return the most likely distribution of units that are all of one mode."""
+def _fitted(units: Sequence[Unit]) -> LensPrior:
     lenses = np.array([unit.lens for unit in units])
     own = np.array([unit.covariance for unit in units])
     vague = np.array([unit.one_turn for unit in units])
@@ -277,5 +276,4 @@ def _scales(camera: Camera) -> Floats:
 
 
 def _lens_places(count: int) -> list[int]:
-    """Return the places of what units of a model share: the focal length, the distortion."""
     return [0, *range(4, count)]

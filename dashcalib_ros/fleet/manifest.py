@@ -89,7 +89,6 @@ def read_manifest(place: str, group_by: str | None = None) -> list[Row]:
 
 
 def _found(place: str) -> list[str]:
-    """Return what lies in a folder, or what a glob finds."""
     if storage.is_pattern(place):
         return storage.listed(place)
     if not storage.is_folder(place):
@@ -106,7 +105,6 @@ def _found(place: str) -> list[str]:
 
 
 def _may_be_a_clip(name: str) -> bool:
-    """Return whether a folder's entry may be a clip: notes and tables lie there, too."""
     suffix = posixpath.splitext(name)[1].lower()
     return suffix in (*VIDEO_SUFFIXES, GATHERED) or is_bag_file(name) or storage.is_folder(name)
 
@@ -204,7 +202,6 @@ def _rate(text: str) -> float:
 
 
 def _time(text: str) -> float:
-    """Return s since 1970 from a number or an ISO date; a date without a zone is UTC."""
     try:
         seconds = float(text)
     except ValueError:
@@ -220,7 +217,6 @@ def _time(text: str) -> float:
 
 
 def _grouped(row: Row, pattern: re.Pattern[str]) -> Row:
-    """Return the row with the camera, and the make, that stand in its clip's name."""
     if not row.clip:
         return row
     found = pattern.search(row.clip)

@@ -89,7 +89,6 @@ def duration(seconds: float) -> str:
 
 
 def _makes(cameras: Rows) -> Section:
-    """Return each model's focal lengths: their middle and spread, and all of them in a plot."""
     makes: dict[str, list[Mapping[str, Any]]] = {}
     for row in cameras:
         if row['fx']:
@@ -156,7 +155,6 @@ def _sigma_by_clips(cameras: Rows, clips: Rows) -> Section:
 
 
 def _drift(cameras: Rows, clips: Rows) -> Section:
-    """Return the fx of each dated clip alone, over time; lines: cameras that drift."""
     own = {row['camera']: row for row in cameras if row['fx']}
     found = [(YEAR_0 + row['time'] / YEAR_S, 100 * (row['fx'] / own[row['camera']]['fx'] - 1),
               row['camera']) for row in clips
@@ -186,14 +184,12 @@ def _drift(cameras: Rows, clips: Rows) -> Section:
 
 
 def _ends(values: Sequence[float]) -> tuple[float, float]:
-    """Return the ends of an axis that shows all values."""
     low, high = min(values), max(values)
     margin = 0.05 * (high - low) or 0.05 * abs(high) or 1.0
     return low - margin, high + margin
 
 
 def _dots(axes: Axes, found: Sequence[tuple[float, float, str]]) -> str:
-    """Return (x, y, verdict) as dots, LISTED at the most, evenly chosen."""
     some = found[::-(-len(found) // LISTED)]
     return ''.join(
         f'<g class="{verdict}">' + strokes(axes.places(
@@ -208,7 +204,6 @@ def _figure(caption: str, axes: Axes, parts: Sequence[str]) -> tuple[str, str]:
 
 
 def _reasons(title: str, what: str, found: Iterable[tuple[str, str, str]]) -> Section:
-    """Return how often each code came, with which reason first, and with what."""
     groups: dict[str, list[tuple[str, str]]] = {}
     for code, reason, name in found:
         groups.setdefault(code or reason, []).append((reason.removesuffix(f' [{code}]'), name))
@@ -238,7 +233,6 @@ def _listed(cameras: Rows) -> Section:
 
 
 def _link(row: Mapping[str, Any]) -> str:
-    """Return a camera's name, with a link to its report where there is one."""
     # loaded with jinja2, by those who write a page
     from markupsafe import Markup
     if row['verdict_alone'] == 'refused' and row['model'] is None and not row['width']:

@@ -12,7 +12,7 @@ import numpy as np
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera, camera_of
 from dashcalib_ros.camera.mapping import sensitivity
-from dashcalib_ros.errors import InputError, Notice, one_line
+from dashcalib_ros.errors import InputError, Notice, coded, one_line
 from dashcalib_ros.fleet import lens_prior
 from dashcalib_ros.fleet.lens_prior import LensPrior, ModelPrior, Unit, conditioned
 from dashcalib_ros.formats import result_dict
@@ -29,17 +29,23 @@ FORMAT = 5
 class ClipShare:
     """What a clip gave to its camera's calibration.
 
-    used: turns in the adjustment. left_out: why none is, with a code, '' otherwise. fx, fx_sigma:
-    of its turns alone, in px of the input, linearised at the camera's solution; None where
-    unknown. The sigma is that of their noise, without how much turns differ beyond it.
+    used: turns in the adjustment. left_out: why none is, '' otherwise; code: of that. fx,
+    fx_sigma: of its turns alone, in px of the input, linearised at the camera's solution; None
+    where unknown. The sigma is that of their noise, without how much turns differ beyond it.
     sigma_so_far: of fx by this clip and all before it, by name; as the camera's.
     """
 
     used: int = 0
     left_out: str = ''
+    code: str = ''
     fx: float | None = None
     fx_sigma: float | None = None
     sigma_so_far: float | None = None
+
+    @classmethod
+    def without(cls, why: Notice) -> ClipShare:
+        """Return the share of a clip that is left out."""
+        return cls(left_out=coded(why), code=why.code)
 
 
 @dataclass(frozen=True)
@@ -191,14 +197,14 @@ def _verdict(own: CalibrationData, make: str, camera: Camera, covariance: Floats
     """Return the verdict with a prior: it never makes a result accepted."""
     if own.verdict.level == 'accepted':
         return own.verdict
-    sigma, code = 100 * float(np.sqrt(covariance[0, 0])) / camera.fx, 'E-PRIOR-USED'
-    text = (f'{100 * share:.0f} % of the information about fx comes from the prior of the camera '
-            f'model {make} ({prior.units} other cameras), the rest from its own turns; sigma of '
-            f'fx with it: {sigma:.1f} %')
-    return Verdict('weak', (
-        text, *(f'without the prior: {reason}' for reason in own.verdict.reasons)),
-        codes=(code, *own.verdict.codes),
-        conditions=(Condition(code, text, '', '', False), *own.verdict.conditions))
+    sigma = 100 * float(np.sqrt(covariance[0, 0])) / camera.fx
+    why = Notice(
+        'E-PRIOR-USED', f'{100 * share:.0f} % of the information about fx comes from the prior of '
+        f'the camera model {make} ({prior.units} other cameras), the rest from its own turns; '
+        f'sigma of fx with it: {sigma:.1f} %')
+    return Verdict('weak', (why, *(
+        Notice(each.code, f'without the prior: {each}') for each in own.verdict.reasons)),
+        (Condition(why.code, why, '', '', False), *own.verdict.conditions))
 
 
 def _picture_sigma(camera: Camera, covariance: Floats, alone: PictureSigma) -> PictureSigma:

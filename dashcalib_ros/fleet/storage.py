@@ -139,7 +139,6 @@ def stamp(place: str) -> str | None:
 
 
 def _stored_stamps(url: str) -> list[str]:
-    """Return what changes with a file of a store, or with each of a folder; [] without one."""
     system, path = _system(url)
     entries: dict[str, Any] = {}
     with _store_errors('read', url), suppress(FileNotFoundError):
@@ -236,7 +235,6 @@ def _reason(error: Exception, place: str) -> str:
 
 
 def _system(url: str) -> tuple[Any, str]:
-    """Return fsspec's file system of a URL, and the path there; raises InputError."""
     scheme, _, rest = url.partition('://')
     if scheme not in SCHEMES or '://' in rest or '::' in url:
         raise InputError('E-ADDRESS-REFUSED', f'{masked(url)} is not opened: use a path, or one '

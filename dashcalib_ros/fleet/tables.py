@@ -17,8 +17,8 @@ import numpy as np
 
 from dashcalib_ros.arrays import plain_values
 from dashcalib_ros.camera import calibrated_models
-from dashcalib_ros.errors import Notice, coded, counted, visible
-from dashcalib_ros.fleet.clips import ClipResult, hash_of
+from dashcalib_ros.errors import Notice, code_of, coded, counted, visible
+from dashcalib_ros.fleet.clips import LONGEST, ClipResult, hash_of
 from dashcalib_ros.fleet.manifest import Row
 from dashcalib_ros.fleet.solved import ClipShare, Final, Solved
 from dashcalib_ros.fleet.storage import has, joined, write
@@ -32,9 +32,6 @@ YEAR_S = 365.25 * 86400
 LEAST_CLIPS = 3
 # the end of a camera's folder whose name is not the camera's
 HASHED = re.compile(r'-[0-9a-f]{32}$')
-
-# the end of a text by coded()
-CODED = re.compile(r' \[(E-[A-Z0-9-]+)\]$')
 
 # how a text begins that a spreadsheet runs
 FORMULA = ('=', '+', '-', '@')
@@ -90,8 +87,8 @@ def camera_row(solved: Solved, final: Final, clips: Sequence[Mapping[str, Any]])
     return row
 
 
-def failed_row(camera: str, make: str, clips: Sequence[Mapping[str, Any]], reason: str = ''
-               ) -> dict[str, Any]:
+def failed_row(camera: str, make: str, clips: Sequence[Mapping[str, Any]],
+               why: Exception | str = '') -> dict[str, Any]:
     """Return the row of a camera without a result: of its clips, and why there is none."""
     drift, drift_sigma = _drift(clips)
     count = Counter(row['status'] for row in clips)
@@ -103,9 +100,9 @@ def failed_row(camera: str, make: str, clips: Sequence[Mapping[str, Any]], reaso
         'turns_used': sum(row['turns_used'] for row in clips),
         'seconds': float(sum(row['seconds'] for row in clips)), 'prior_units': 0,
         'prior_share': 0.0, 'prior_note': '', 'other_mode': False,
-        'drift_percent_per_year': drift, 'drift_sigma': drift_sigma, 'reasons': [reason],
-        'reason_codes': [_code(reason)],
-        'warnings': [], 'folder': camera_folder(camera)}
+        'drift_percent_per_year': drift, 'drift_sigma': drift_sigma,
+        'reasons': [coded(why, LONGEST)], 'reason_codes': [code_of(why)], 'warnings': [],
+        'folder': camera_folder(camera)}
 
 
 def camera_folder(camera: str) -> str:
@@ -124,38 +121,33 @@ def clip_rows(camera: str, make: str, clips: Sequence[tuple[Row, ClipResult]],
     for row, result in clips:
         share = shares.get(row.name, ClipShare())
         if result.file and first.setdefault(row.name, row.number) != row.number:
-            share = ClipShare(left_out=coded(Notice(
-                'E-CLIP-REPEATED', f'is the same clip as in row {first[row.name]}')))
-        status, reason = _status(result, share)
+            share = ClipShare.without(Notice(
+                'E-CLIP-REPEATED', f'is the same clip as in row {first[row.name]}'))
+        status, reason, code = _status(result, share)
         # videos count from 0, which is no date
         time = next((time for time in (row.time_s, result.time)
                      if time is not None and time > DATES_S), None)
         found.append({
             **vars(result), 'row': row.number, 'clip': row.clip, 'camera': camera,
-            'make': make or None, 'status': status, 'reason': reason, 'code': _code(reason),
+            'make': make or None, 'status': status, 'reason': reason, 'code': code,
             'turns_used': share.used, 'fx': share.fx, 'sigma_fx_noise': share.fx_sigma,
             'sigma_fx_so_far': share.sigma_so_far, 'time': time})
     return found
 
 
-def _status(result: ClipResult, share: ClipShare) -> tuple[str, str]:
+def _status(result: ClipResult, share: ClipShare) -> tuple[str, str, str]:
     if not result.file:
-        return 'unreadable', result.problem
+        return 'unreadable', result.problem, result.code
     if share.left_out:
-        return 'left out', share.left_out
+        return 'left out', share.left_out, share.code
     if share.used:
-        return 'used', ''
-    if not result.turns:
-        return 'no turn', coded(Notice('E-NO-TURN', 'the car does not turn, or does not move'))
-    if not result.scenes:
-        return 'no scene', coded(Notice(
-            'E-NO-SCENE', f'none of its {counted(result.turns, "turn")} could be reconstructed'))
-    return 'not needed', 'other turns of the camera are used'
-
-
-def _code(reason: str) -> str:
-    found = CODED.search(reason)
-    return found[1] if found else ''
+        return 'used', '', ''
+    if result.scenes:
+        return 'not needed', 'other turns of the camera are used', ''
+    why = Notice('E-NO-SCENE', f'none of its {counted(result.turns, "turn")} could be '
+                 f'reconstructed') if result.turns else Notice(
+        'E-NO-TURN', 'the car does not turn, or does not move')
+    return 'no scene' if result.turns else 'no turn', coded(why), why.code
 
 
 def _drift(clips: Sequence[Mapping[str, Any]]) -> tuple[float | None, float | None]:

@@ -86,7 +86,7 @@ def binary_cameras(path: Path) -> Cameras:
             at += 24 + 8 * len(params)
     except (struct.error, KeyError) as error:
         raise InputError('E-COLMAP-BINARY',
-                         f'{path} is no cameras.bin that can be read; convert it (colmap '
+                         f'{path} is not a readable cameras.bin; convert it (colmap '
                          f'model_converter --output_type TXT)') from error
     return found
 
@@ -108,13 +108,12 @@ def database_cameras(path: Path) -> Cameras:
                 found[str(number)] = partial(_read, (NUMBERED[model][0], *size, *values), path)
     except (apsw.Error, struct.error, KeyError, TypeError) as error:
         raise InputError('E-COLMAP-BINARY',
-                         f'{path} is no database of COLMAP with cameras that can be read; export '
+                         f'{path} is not a COLMAP database with readable cameras; export '
                          f'the model (colmap model_converter --output_type TXT)') from error
     return found
 
 
 def _read(values: Sequence[Any], path: Path) -> Camera | OtherLens:
-    """Return the camera of a line without its number: model, width, height, parameters."""
     if len(values) < 3:
         raise InputError('E-CALIBRATION-COUNT',
                          f'{path} has a line without model, width and height; write it again')

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cameras of data sets whose files are JSON, Arrow or Python: only read.
+"""The cameras of data sets: only read.
 
 nuScenes, Argoverse 1 and 2 and Cityscapes publish pictures without distortion; of Argoverse's
 coefficients, which belong to the pictures before that, nothing is taken.
@@ -7,6 +7,7 @@ coefficients, which belong to the pictures before that, nothing is taken.
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from contextlib import suppress
 from functools import partial, reduce
 from pathlib import Path
@@ -19,10 +20,12 @@ from dashcalib_ros.formats.values import (
     PLUMB_BOB,
     Cameras,
     Data,
+    Read,
     Sizeless,
     camera_with,
     distortion_model,
     focal_and_centre,
+    numbers_in,
     pinhole,
     read_matrix,
     read_number,
@@ -39,7 +42,61 @@ CITYSCAPES_SIZE = (2048, 1024)
 PREFIX = re.compile(r'^(?:key\.|\[CameraCalibrationComponent\]\.)')
 WAYMO = ('f_u', 'f_v', 'c_u', 'c_v', 'k1', 'k2', 'p1', 'p2', 'k3')
 WAYMO_NAMES = ('UNKNOWN', 'FRONT', 'FRONT_LEFT', 'FRONT_RIGHT', 'SIDE_LEFT', 'SIDE_RIGHT')
+# of KITTI's lines, a name and numbers each: how many there are
+Lines = dict[str, list[float]]
+KITTI_COUNTS = {'S': 2, 'K': 9, 'D': 5, 'P': 12}
 LENSES = {'Fisheye': EQUIDISTANT, 'Telecam': PLUMB_BOB}
+
+
+def kitti(text: str, path: Path) -> Cameras:
+    """Return the cameras of KITTI's calib_cam_to_cam.txt, or of the calib.txt of its odometry.
+
+    A camera has two kinds of pictures, raw and rectified ones, of different sizes; those that are
+    published as synchronised and all of the odometry are rectified, and have the K of P.
+    """
+    lines: Lines = {}
+    for line in text.splitlines():
+        if found := re.fullmatch(r'(P\d|(?:[SKDP]_(?:rect_)?)\d\d):(.*)', line.strip()):
+            lines[found[1]] = numbers_in(found[2]) or []
+    for name, values in lines.items():
+        if len(values) != KITTI_COUNTS[name[0]]:
+            raise InputError('E-CALIBRATION-COUNT',
+                             f'{path}: {name} must have {KITTI_COUNTS[name[0]]} numbers, and has '
+                             f'{len(values)}')
+    numbers = [name[2:] for name in lines if re.fullmatch(r'K_\d\d', name)]
+    raw = {number: partial(_kitti_raw, lines, number, path) for number in numbers
+           if {f'D_{number}', f'S_{number}'} <= lines.keys()}
+    rectified = {number: partial(_kitti_rectified, lines, number, path) for number in raw
+                 if {f'P_rect_{number}', f'S_rect_{number}'} <= lines.keys()}
+    return {
+        **{name: partial(pinhole, _view_of(values), path) for name, values in lines.items()
+           if re.fullmatch(r'P\d', name)},
+        **{number: partial(_kitti_either, lines, number, raw[number], rectified[number])
+           if number in rectified else raw[number] for number in raw},
+        **{f'raw_{number}': read for number, read in raw.items() if number in rectified},
+        **{f'rect_{number}': read for number, read in rectified.items()}}
+
+
+def _kitti_raw(lines: Lines, number: str, path: Path) -> Camera:
+    return camera_with(lines[f'S_{number}'], focal_and_centre(lines[f'K_{number}']), PLUMB_BOB,
+                       lines[f'D_{number}'], path)
+
+
+def _kitti_rectified(lines: Lines, number: str, path: Path) -> Camera:
+    return camera_with(lines[f'S_rect_{number}'], _view_of(lines[f'P_rect_{number}']), PLUMB_BOB,
+                       (), path)
+
+
+def _view_of(p: list[float]) -> list[float]:
+    """Return fx, fy, cx, cy of P (12,); its last column is the distance to the first camera."""
+    return [p[0], p[5], p[2], p[6]]
+
+
+def _kitti_either(lines: Lines, number: str, raw: Callable[[], Camera],
+                  rectified: Callable[[], Camera]) -> Read:
+    def of(size: tuple[int, int]) -> Camera:
+        return (rectified if list(size) == lines[f'S_rect_{number}'] else raw)()
+    return Sizeless(of, f'write rect_{number} for rectified pictures, raw_{number} for others')
 
 
 def nuscenes(data: Any, path: Path) -> Cameras:
@@ -67,7 +124,7 @@ def nuscenes(data: Any, path: Path) -> Cameras:
 
 
 def _nuscenes(data: Data, path: Path) -> Sizeless:
-    return pinhole(read_matrix(data, 'camera_intrinsic', path), path)
+    return pinhole(focal_and_centre(read_matrix(data, 'camera_intrinsic', path)), path)
 
 
 def argoverse(data: Any, path: Path) -> Cameras:
@@ -88,7 +145,7 @@ def _argoverse(data: Data, path: Path) -> Sizeless:
     if read_number(data, 'skew_', path, 0.0):
         raise InputError('E-CAMERA-SKEW', f'{path} has a skew, which no supported model has: '
                                           f'calibrate without it')
-    return pinhole([view[0], 0, view[2], 0, view[1], view[3], 0, 0, 1], path)
+    return pinhole(view, path)
 
 
 def _argoverse2(data: Data, path: Path) -> Camera:
@@ -207,5 +264,4 @@ def _vipe(rows: Any, path: Path) -> Sizeless:
         raise InputError('E-CALIBRATION-VARIES',
                          f'{path} has another camera for each frame; run ViPE with intrinsics '
                          f'that are the same for all')
-    fx, fy, cx, cy = read_numbers(rows[0], 'data', path, 4)
-    return pinhole([fx, 0, cx, 0, fy, cy, 0, 0, 1], path)
+    return pinhole(read_numbers(rows[0], 'data', path, 4), path)

@@ -31,7 +31,7 @@ def export(calibration: Given, kind: str) -> str | bytes:
     write = EXPORTS[kind].write if kind in EXPORTS else None
     if write is None:
         raise ConfigError('E-EXPORT-KIND',
-                          f'{kind!r} is no kind of export; use one of {", ".join(EXPORTS)}')
+                          f'{kind!r} is not a kind of export; use one of {", ".join(EXPORTS)}')
     return write(given_camera(calibration))
 
 
@@ -52,7 +52,7 @@ def resized(camera: Camera, size: tuple[int, int]) -> Camera:
     """
     if min(size) < 1:
         raise ConfigError('E-SIZE-NOT-POSITIVE',
-                          f'{size_text(size)} is no size of a picture; write its width and '
+                          f'{size_text(size)} is not a picture size; write its width and '
                           f'height in px')
     check_pixels(*size, 'the resized picture')
     if not same_shape(camera.image_size, size):
@@ -69,7 +69,7 @@ def cropped(camera: Camera, left: int, top: int, width: int, height: int) -> Cam
     if (min(left, top) < 0 or min(width, height) < 1 or left + width > camera.image_size[0]
             or top + height > camera.image_size[1]):
         raise ConfigError('E-CROP-OUTSIDE',
-                          f'{left},{top},{width},{height} is no part of a picture of '
+                          f'{left},{top},{width},{height} is not a part of a picture of '
                           f'{size_text(camera.image_size)}; write X,Y,W,H in px: the top left '
                           f'corner of the part, and its size')
     return replace(camera, image_size=(width, height), cx=camera.cx - left, cy=camera.cy - top)

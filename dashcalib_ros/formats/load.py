@@ -110,7 +110,6 @@ def load_pair(a: str | os.PathLike[str], b: str | os.PathLike[str]
 
 def _checked(label: str, found: Read, size: Callable[[], Size | None], nearest: bool
              ) -> NamedCamera:
-    """Return a camera with its warnings. label: its file and name."""
     if isinstance(found, Sizeless):
         known = size()
         if known is None:
@@ -131,7 +130,6 @@ def _checked(label: str, found: Read, size: Callable[[], Size | None], nearest: 
 
 
 def _nearest(label: str, lens: OtherLens) -> tuple[Camera, tuple[Notice, ...]]:
-    """Return the camera that is nearest to a lens, and by how much it is off."""
     found = nearest_camera(lens)
     check_lens(found.camera, label)
     unseen = (f'; the lens has no ray for {100 * found.unseen:.0f} % of the picture'
@@ -144,7 +142,6 @@ def _nearest(label: str, lens: OtherLens) -> tuple[Camera, tuple[Notice, ...]]:
 
 
 def _loaded(path: str | os.PathLike[str], name: str | None) -> tuple[str, Read]:
-    """Return the camera that a file has, and what it is called in messages."""
     text = str(path_of(path))
     before, _, after = text.rpartition(':')
     # lexists() takes any text, also one that is too long for a name
@@ -187,7 +184,6 @@ def _text_cameras(text: str, place: Path) -> Cameras:
 
 
 def _cameras_in(data: Any, path: Path) -> Cameras:
-    """Return the cameras that a file's data has. Raises InputError where no format has any."""
     for form in FORMATS.values():
         if form.in_data and (found := form.in_data(data, path)):
             return found
@@ -201,7 +197,6 @@ def _unknown(path: Path, model: str | None = None) -> InputError:
 
 
 def _chosen(cameras: Cameras, name: str | None, path: str | Path) -> tuple[str, Read]:
-    """Return the camera of a name, and what it is called in messages."""
     if name is None and len(cameras) == 1:
         name = next(iter(cameras))
     if name is not None and name not in cameras and name.isdecimal():
@@ -220,7 +215,6 @@ def _chosen(cameras: Cameras, name: str | None, path: str | Path) -> tuple[str, 
 
 
 def _decoded(text: str, path: Path) -> Any:
-    """Return what a text of XML, JSON or YAML has. Raises InputError."""
     start = text.lstrip()[:1]
     if start == '<':
         return _element(xml_root(text, path))
@@ -255,7 +249,6 @@ def _element(node: ElementTree.Element) -> Any:
 
 
 def _arrays(path: Path) -> Data:
-    """Return the small arrays of an .npz, as lists."""
     try:
         check_file(path)
         with path.open('rb') as file:
@@ -275,7 +268,6 @@ def _arrays(path: Path) -> Data:
 
 
 def _table(path: Path) -> list[Data]:
-    """Return the rows of an Arrow file or a Parquet file, as data sets have them."""
     check_file(path, limit=JSON_BYTES)
     try:
         from pyarrow import feather, parquet
@@ -288,7 +280,7 @@ def _table(path: Path) -> list[Data]:
         return list(table.slice(0, ROWS).to_pylist())
     except Exception as error:  # a damaged file makes Arrow raise nearly anything
         raise InputError('E-CALIBRATION-TABLE',
-                         f'{path} is no table that can be read; copy it again') from error
+                         f'{path} is not a readable table; copy it again') from error
 
 
 def given_camera(given: Given, size: Callable[[], Size | None] = lambda: None) -> NamedCamera:

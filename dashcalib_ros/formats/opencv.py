@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """OpenCV's camera matrix and distortion coefficients, as ROS and many scripts write them, too.
 
-Read from YAML, XML, JSON and .npz; written as cv2.FileStorage does.
+Read from YAML, XML, JSON and .npz; written as cv2.FileStorage does, and beside a value for each
+pixel in an .npz: viewing rays, and the maps of cv2.remap.
 """
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -12,10 +14,12 @@ from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
-from dashcalib_ros.camera import NO_DISTORTION, ros_faults
+from dashcalib_ros.camera import NO_DISTORTION, Camera, ros_faults
 from dashcalib_ros.camera.other import OtherLens, plane, undone
 from dashcalib_ros.camera.other import opencv as distortion
+from dashcalib_ros.camera.remap import source_map
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.formats.values import (
     EQUIDISTANT,
@@ -149,3 +153,27 @@ def write(found: NamedCamera) -> str:
     file.write('camera_matrix', camera.matrix)
     file.write('distortion_coefficients', np.array([camera.ros_distortion()]))
     return str(file.releaseAndGetString())
+
+
+def write_rays(found: NamedCamera) -> bytes:
+    """Return an .npz with rays (h, w, 3): the unit viewing ray of each pixel, NaN for none."""
+    camera, (width, height) = found.camera, found.image_size
+    pixels = np.stack(np.meshgrid(np.arange(width, dtype=float),
+                                  np.arange(height, dtype=float)), -1)
+    ideal = pixels if found.field is None else found.field.ideal(pixels)
+    return _npz(camera, rays=camera.rays(ideal).astype(np.float32))
+
+
+def write_maps(found: NamedCamera) -> bytes:
+    """Return an .npz with map_x, map_y (h, w) for cv2.remap: to a pinhole with the same K."""
+    x, y = np.moveaxis(source_map(found.camera, field=found.field), -1, 0)
+    return _npz(found.camera, map_x=x, map_y=y)
+
+
+def _npz(camera: Camera, **arrays: npt.NDArray[np.float32]) -> bytes:
+    file = io.BytesIO()
+    both: dict[str, Any] = {
+        **arrays, 'K': camera.matrix, 'D': np.array(camera.ros_distortion()),
+        'distortion_model': np.array(camera.ros_model), 'image_size': np.array(camera.image_size)}
+    np.savez(file, **both)
+    return file.getvalue()

@@ -10,10 +10,10 @@ import dataclasses
 import json
 import math
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from dashcalib_ros.camera.field import TERMS as FIELD_TERMS
 from dashcalib_ros.camera.other import OtherLens
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Bend, TurnId
-from dashcalib_ros.errors import DashcalibError, InputError, Notice, one_line
+from dashcalib_ros.errors import DashcalibError, InputError, Notice, code_of, one_line
 from dashcalib_ros.formats import opencv, ros
 from dashcalib_ros.formats.plausible import check_lens
 from dashcalib_ros.formats.values import (
@@ -57,6 +57,7 @@ from dashcalib_ros.limits import JSON_BYTES, parse_json, parse_yaml, path_of, re
 from dashcalib_ros.solve.solution import LeftOut
 from dashcalib_ros.solve.spread import PictureSigma
 
+T = TypeVar('T')
 # arrays of a calibration that stand among the details
 COVARIANCES = ('covariance', 'picture_covariance')
 
@@ -160,10 +161,8 @@ def calibration_of(data: Data, camera: Camera | None) -> CalibrationData:
     field, size = data.get('field'), (data['image_size'][0], data['image_size'][1])
     sigma = data.get('sigma')
     return CalibrationData(
-        verdict=Verdict(data['verdict'], tuple(data['reasons']),
-                        codes=tuple(data.get('reason_codes', ())),
-                        conditions=tuple(Condition(**each)
-                                         for each in data.get('conditions', ()))),
+        verdict=Verdict(data['verdict'], _notices(data, 'reasons', 'reason_codes'), tuple(
+            Condition(**each) for each in data.get('conditions', ()))),
         image_size=size, camera=camera,
         sigma=None if sigma is None else {name: math.nan if value is None else float(value)
                                           for name, value in sigma.items()},
@@ -182,7 +181,7 @@ def calibration_of(data: Data, camera: Camera | None) -> CalibrationData:
         field=None if field is None else LensField(
             Field(size, np.array(field['coefficients'], np.float64)), _counts(field),
             field['rms_px'], field['worst_px'], field['sigma_px']),
-        mount=_mount(data.get('mount')),
+        mount=_readable(_mount, data.get('mount')),
         held_out=tuple(held_out), straight_lines=made(Bend, data.get('straight_lines')),
         witnesses=Witnesses(**{name: made(Witness, each) for name, each
                                in (data.get('witnesses') or {}).items()}),
@@ -194,7 +193,6 @@ def calibration_of(data: Data, camera: Camera | None) -> CalibrationData:
 
 
 def _frozen(value: Any) -> Any:
-    """Return the value with tuples for its lists."""
     return tuple(map(_frozen, value)) if isinstance(value, list) else value
 
 
@@ -207,7 +205,7 @@ def _held_out_dict(turn: LeftOut) -> dict[str, Any]:
 
 def codes_of(lines: Iterable[str]) -> list[str]:
     """Return the codes of warnings or reasons; '' for a line that is no Notice."""
-    return [line.code if isinstance(line, Notice) else '' for line in lines]
+    return [*map(code_of, lines)]
 
 
 def _notices(data: Any, texts: str, codes: str) -> tuple[Notice, ...]:
@@ -268,7 +266,6 @@ def cameras(data: Any, path: Path) -> Cameras:
 
 
 def _has_block(data: Any) -> bool:
-    """Return whether a file's data is a calibration.yaml with our block."""
     return opencv.has_matrix(data) and isinstance(data.get(ros.OWN), dict)
 
 
@@ -285,14 +282,13 @@ def _read(data: Data, path: Path) -> NamedCamera:
     return dataclasses.replace(
         found, sigma=sigma, verdict=None if verdict is None else str(verdict),
         covariance=_covariance(values.get('details'), camera, sigma),
-        sigma_px=_sigma_px(values.get('sigma_px')),
+        sigma_px=_readable(_sigma_px, values.get('sigma_px')),
         field=_used_field(values.get('field'), camera.image_size),
-        mount=_mount(values.get('mount')),
-        readout_ms=_readout_ms(values.get('rolling_shutter')))
+        mount=_readable(_mount, values.get('mount')),
+        readout_ms=_readable(_readout_ms, values.get('rolling_shutter')))
 
 
 def _intrinsics(data: Data, path: Path) -> Camera:
-    """Return result.json's camera. Raises InputError."""
     given = data.get('intrinsics')
     if not given:
         raise _no_intrinsics(str(path), data['verdict'], data.get('reasons'))
@@ -310,7 +306,6 @@ def _intrinsics(data: Data, path: Path) -> Camera:
 
 
 def _no_intrinsics(name: str, verdict: Any, reasons: Any) -> InputError:
-    """Return the error for a refused calibration."""
     known = '; '.join(map(str, reasons)) if isinstance(reasons, (list, tuple)) else ''
     return InputError('E-NO-INTRINSICS',
                       f'{name} has no intrinsics to compare, its verdict is {verdict}'
@@ -322,18 +317,16 @@ def calibrated_camera(calibration: CalibrationData, name: str = 'estimate') -> N
     if calibration.camera is None:
         raise _no_intrinsics(name, calibration.verdict.level, calibration.verdict.told)
     shutter, field = calibration.rolling_shutter, calibration.field
+    covariance, of_picture = calibration.covariance, calibration.picture_covariance
+    if of_picture is not None:
+        # it may have further parameters behind the camera's
+        count = len(calibration.camera.params)
+        covariance = of_picture[:count, :count]
     return NamedCamera(name, calibration.camera, calibration.sigma, calibration.verdict.level,
-                       _of_camera(calibration, len(calibration.camera.params)),
-                       calibration.sigma_px,
+                       covariance, calibration.sigma_px,
                        field.field if field is not None and field.used else None,
                        mount=calibration.mount,
                        readout_ms=None if shutter is None else shutter.readout_ms)
-
-
-def _of_camera(calibration: CalibrationData, count: int) -> Floats | None:
-    """Return the covariance of the camera's parameters, as the picture shows them."""
-    found = calibration.picture_covariance
-    return calibration.covariance if found is None else found[:count, :count]
 
 
 def _covariance(details: Any, camera: Camera, sigma: Mapping[str, float] | None
@@ -369,7 +362,6 @@ def _counts(field: Mapping[str, Any]) -> bool:
 
 
 def _used_field(data: Any, image_size: tuple[int, int]) -> Field | None:
-    """Return result.json's field, None where there is none that is used."""
     if not isinstance(data, Mapping) or not _counts(data):
         return None
     try:
@@ -382,37 +374,32 @@ def _used_field(data: Any, image_size: tuple[int, int]) -> Field | None:
     return Field(image_size, coefficients)
 
 
-def _mount(data: Any) -> Mount | None:
-    """Return a file's mounting; a missing one, or one that cannot be read, is no error."""
+def _readable(read: Callable[[Any], T], data: Any) -> T | None:
+    """Return what a part of a file says; one that is missing, or cannot be read, is no error."""
     try:
-        travel, sigma = ([float(value) for value in data['travel_px']],
-                         {name: None if data['sigma'][name] is None
-                          else read_number(data['sigma'], name, '')
-                          for name in (*ANGLES, 'height_m')})
-        roll, height = (None if data[name] is None else read_number(data, name, '')
-                        for name in ('roll_right_deg', 'height_m'))
-        return Mount('accepted' if data['verdict'] == 'accepted' else 'weak',
-                     _notices(data, 'reasons', 'reason_codes'),
-                     read_number(data, 'yaw_left_deg', ''),
-                     read_number(data, 'pitch_up_deg', ''), roll, height, sigma,
-                     (travel[0], travel[1]), read_number(data, 'travel_sigma_px', ''),
-                     read_number(data, 'straight_m', ''),
-                     None if data.get('moved_s') is None else read_number(data, 'moved_s', ''))
-    except (KeyError, IndexError, TypeError, ValueError, InputError):
+        return read(data)
+    except (AttributeError, KeyError, IndexError, TypeError, ValueError, InputError):
         return None
 
 
-def _sigma_px(data: Any) -> PictureSigma | None:
-    """Return result.json's sigma over the picture; a missing one is no error."""
-    try:
-        return PictureSigma(*(read_number(data, key, '') for key in ('rms', 'worst')))
-    except (AttributeError, TypeError, InputError):
-        return None
+def _mount(data: Any) -> Mount:
+    def known(values: Any, name: str) -> float | None:
+        return None if values[name] is None else read_number(values, name, '')
+
+    travel = [float(value) for value in data['travel_px']]
+    return Mount('accepted' if data['verdict'] == 'accepted' else 'weak',
+                 _notices(data, 'reasons', 'reason_codes'),
+                 read_number(data, 'yaw_left_deg', ''), read_number(data, 'pitch_up_deg', ''),
+                 known(data, 'roll_right_deg'), known(data, 'height_m'),
+                 {name: known(data['sigma'], name) for name in (*ANGLES, 'height_m')},
+                 (travel[0], travel[1]), read_number(data, 'travel_sigma_px', ''),
+                 read_number(data, 'straight_m', ''),
+                 known({'moved_s': None, **data}, 'moved_s'))
 
 
-def _readout_ms(data: Any) -> float | None:
-    """Return result.json's readout time; a missing one is no error."""
-    try:
-        return read_number(data, 'readout_ms', '')
-    except (AttributeError, TypeError, InputError):
-        return None
+def _sigma_px(data: Any) -> PictureSigma:
+    return PictureSigma(*(read_number(data, key, '') for key in ('rms', 'worst')))
+
+
+def _readout_ms(data: Any) -> float:
+    return read_number(data, 'readout_ms', '')

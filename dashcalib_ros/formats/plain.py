@@ -53,7 +53,6 @@ def _has_view(data: Any) -> bool:
 
 
 def _read(data: Data, path: Path) -> NamedCamera | OtherLens:
-    """Return the camera; coefficients after k2 may be omitted."""
     entries = opencv.Entries(data, path)
     view = [read_number(data, entries.key(*names) or names[0], path) for names in VIEW]
     if isinstance(entries.first(*opencv.DISTORTION), (list, dict)):

@@ -94,10 +94,11 @@ def doubts(camera: Camera, path: object) -> tuple[Notice, ...]:
                 'correct it, unless the pictures are stretched')
         found.append(Notice('E-CALIBRATION-ASPECT', f'{_aspect_text(camera, path)}; {cure}'))
     if camera.fx > LONGEST * width:
+        across_deg = 2 * np.degrees(np.arctan(0.5 * width / camera.fx))
         found.append(Notice(
             'E-CALIBRATION-NARROW',
-            f'{path}: fx = {camera.fx:.1f} shows only {2 * _angle(0.5 * width / camera.fx):.1f} '
-            f'degrees across; check that it is in px of pictures of '
+            f'{path}: fx = {camera.fx:.1f} shows only {across_deg:.1f} degrees across; check that '
+            f'it is in px of pictures of '
             f'{size_text(camera.image_size)}'))
     size, (unseen, near), angles = _size_doubt(camera, path), _unseen(camera), _angles(camera)
     if angles < FEW_ANGLES and not size:
@@ -116,7 +117,6 @@ def doubts(camera: Camera, path: object) -> tuple[Notice, ...]:
 
 
 def _size_doubt(camera: Camera, path: object) -> tuple[Notice, ...]:
-    """Return that the centre is that of pictures of another size, where it is."""
     size = camera.image_size
     if _off(camera, size) <= AS_GIVEN:
         return ()
@@ -135,7 +135,6 @@ def _size_doubt(camera: Camera, path: object) -> tuple[Notice, ...]:
 
 
 def _size_of(camera: Camera) -> tuple[int, int] | None:
-    """Return the size of the pictures of which the centre is the middle."""
     width, height = camera.image_size
     multiples = [(round(width * n / m), round(height * n / m))
                  for n in range(1, MOST_PARTS + 1) for m in range(1, MOST_PARTS + 1) if n != m]
@@ -162,7 +161,6 @@ def _unseen(camera: Camera) -> tuple[float, float]:
 
 
 def _angles(camera: Camera) -> float:
-    """Return how far out the camera sees, as a share of what it would without distortion."""
     pixels = _pixels(camera)
     with np.errstate(all='ignore'):
         seen = np.arccos(np.clip(camera.rays(pixels)[:, 2], -1, 1))
@@ -181,10 +179,6 @@ def _pixels(camera: Camera) -> Floats:
     u, v = np.meshgrid(*((np.arange(count) + 0.5) / count * side - 0.5
                          for count, side in zip(FINE, camera.image_size, strict=True)))
     return np.stack([u.ravel(), v.ravel()], -1)
-
-
-def _angle(tangent: float) -> float:
-    return float(np.degrees(np.arctan(tangent)))
 
 
 def _coefficients(camera: Camera) -> str:

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """ROS's camera_info: the YAML and INI files of camera_calibration_parsers, and messages.
 
+Autoware's and Foxglove's are the same in other words, and are only written here.
+
 The YAML is what camera_info_manager, usb_cam, v4l2_camera and others load. Keys, order and layout
 are those that camera_calibration_parsers writes. OpenCV's FileStorage reads the file, too. Version
 4 wants the line %YAML; 4 and 5 want lists that are indented, texts of 4096 characters at the most,
@@ -8,6 +10,7 @@ and quotes: 4.2.1 is a broken number to them.
 """
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -28,7 +31,9 @@ from dashcalib_ros.formats.values import (
     Data,
     camera_with,
     focal_and_centre,
+    is_fisheye,
     numbers_in,
+    pinhole_only,
     read_number,
 )
 from dashcalib_ros.input.bag_write import first_camera_info
@@ -90,10 +95,7 @@ def _read_echoed(data: Data, path: Path) -> NamedCamera | OtherLens:
 
 def _check_whole(size: tuple[int, int], binning: Sequence[float], roi: Sequence[float],
                  name: str | Path) -> None:
-    """Raise InputError for a CameraInfo of a part of the sensor, or of one that is binned.
-
-    roi: x, y, width, height.
-    """
+    """Raise InputError for a part of the sensor, or binning. roi: x, y, width, height."""
     if tuple(roi) not in ((0, 0, 0, 0), (0, 0, *size)) or max(binning) > 1:
         raise InputError('E-CALIBRATION-PART',
                          f'{name} has binning or a region of interest: use the calibration of the '
@@ -134,6 +136,23 @@ def ini_cameras(text: str, path: Path) -> Cameras:
 def write(found: NamedCamera) -> str:
     """Return the YAML of a camera alone, without a calibration's sigma and provenance."""
     return yaml_text(document(found.camera))
+
+
+def write_autoware(found: NamedCamera) -> str:
+    """Return it as Autoware's CalibrationTools does. Raises ConfigError for a fisheye."""
+    pinhole_only(found.camera, 'autoware')
+    return write(found)
+
+
+def write_foxglove(found: NamedCamera) -> str:
+    """Return Foxglove's CameraCalibration as JSON, where a fisheye is kannala_brandt."""
+    ros = ros_camera(found.camera)
+    return json.dumps({
+        'timestamp': {'sec': 0, 'nsec': 0}, 'frame_id': 'camera',
+        'width': ros.width, 'height': ros.height,
+        'distortion_model': ('kannala_brandt' if is_fisheye(found.camera)
+                             else ros.distortion_model),
+        'D': ros.d, 'K': ros.k, 'R': ros.r, 'P': ros.p}, indent=2) + '\n'
 
 
 def document(camera: Camera, camera_name: str = CAMERA_NAME, rectified: str = SAME

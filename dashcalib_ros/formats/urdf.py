@@ -1,10 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the camera sits on the car: as URDF, and as a static transform. Neither is read."""
+"""How the camera sits on the car: as URDF, as a static transform, and as VisionPilot's H.yaml.
+
+None is read. H maps a pixel to the road: metres ahead and to the left.
+"""
 from __future__ import annotations
 
 import math
 import re
 from pathlib import Path
+
+import cv2
+import numpy as np
 
 from dashcalib_ros.errors import ConfigError, visible
 from dashcalib_ros.judge.calibration import Mount
@@ -24,12 +30,15 @@ def write(found: NamedCamera) -> str:
 
     Raises ConfigError where the mounting is not known.
     """
-    mount, name = mount_of(found), _frame_name(found.name)
+    mount, name = _mount_of(found), _frame_name(found.name)
     about = [
         f'{found.name}: how the camera sits on the car, {mount.verdict}', *mount.reasons,
         *(f'{what}: {_with_sigma(mount, key)}' for key, what in WRITTEN.items()),
         f'x and y are not known: {BASE} is on the road below the camera until you set them']
-    lines = '\n'.join(f'  {_in_comment(each)}' for each in about)
+    # no comment of XML may have two hyphens
+    lines = '\n'.join(f'  {re.sub("-(?=-)", "- ", visible(each))}' for each in about)
+    # about the fixed axes, as URDF has them
+    rpy = _radians(mount.roll_right_deg or 0.0, -mount.pitch_up_deg, mount.yaw_left_deg)
     return f'''<?xml version="1.0"?>
 <!--
 {lines}
@@ -40,7 +49,7 @@ def write(found: NamedCamera) -> str:
   <joint name="{name}_joint" type="fixed">
     <parent link="{BASE}"/>
     <child link="{name}_link"/>
-    <origin xyz="0 0 {_number(mount.height_m or 0.0)}" rpy="{_radians(*_rpy(mount))}"/>
+    <origin xyz="0 0 {_number(mount.height_m or 0.0)}" rpy="{rpy}"/>
   </joint>
   <link name="{name}_optical_frame"/>
   <joint name="{name}_optical_joint" type="fixed">
@@ -58,7 +67,7 @@ def write_transform(found: NamedCamera) -> str:
     Without a known height it has none, which a comment before it says. Raises ConfigError where
     the mounting is not known.
     """
-    mount = mount_of(found)
+    mount = _mount_of(found)
     turn = ' '.join(f'--q{axis} {_number(value)}'
                     for axis, value in zip('xyzw', mount.quaternion, strict=True))
     known = mount.height_m is not None
@@ -68,8 +77,29 @@ def write_transform(found: NamedCamera) -> str:
             f'--frame-id {BASE} --child-frame-id {_frame_name(found.name)}_optical_frame\n')
 
 
-def mount_of(found: NamedCamera) -> Mount:
-    """Return the mounting. Raises ConfigError where it is not known."""
+def write_road(found: NamedCamera) -> str:
+    """Return H.yaml of pictures without distortion: pixel to the road below the camera, m.
+
+    Raises ConfigError where the mounting or the height is not known.
+    """
+    mount = _mount_of(found)
+    if mount.height_m is None:
+        raise ConfigError('E-EXPORT-NO-HEIGHT',
+                          f'{found.name} has no height of the camera above the road, without '
+                          f'which nothing has a distance; calibrate with --speed, or with GPS')
+    # of a point of the road in the camera's axes: ahead, left, and the camera's height below it
+    to_camera = mount.rotation.T
+    pixel_of = found.camera.matrix @ np.column_stack(
+        [to_camera[:, 0], to_camera[:, 1], -mount.height_m * to_camera[:, 2]])
+    road = np.linalg.inv(pixel_of)
+    file = cv2.FileStorage('.yaml', cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    file.writeComment(f'of {found.name}, for pictures without distortion (export --to maps); x '
+                      f'and y count from the road below the camera')
+    file.write('H', road / road[2, 2] if abs(road[2, 2]) > 1e-9 else road)
+    return str(file.releaseAndGetString())
+
+
+def _mount_of(found: NamedCamera) -> Mount:
     if found.mount is None:
         raise ConfigError('E-EXPORT-NO-MOUNTING',
                           f'{found.name} does not say how the camera sits on the car; calibrate a '
@@ -86,11 +116,6 @@ def _frame_name(source: str) -> str:
     return f'{name}_camera' if f'{name}_link' == BASE else name
 
 
-def _rpy(mount: Mount) -> tuple[float, float, float]:
-    """Return roll, pitch and yaw about the fixed axes, as URDF has them, degrees."""
-    return mount.roll_right_deg or 0.0, -mount.pitch_up_deg, mount.yaw_left_deg
-
-
 def _radians(*degrees: float) -> str:
     return ' '.join(_number(math.radians(each)) for each in degrees)
 
@@ -104,8 +129,3 @@ def _with_sigma(mount: Mount, name: str) -> str:
     if value is None or sigma is None:
         return 'not known, 0 is written'
     return f'{value:.3f}, standard deviation {sigma:.3f}'
-
-
-def _in_comment(text: str) -> str:
-    """Return a text without what no comment of XML may have."""
-    return re.sub('-(?=-)', '- ', visible(text))

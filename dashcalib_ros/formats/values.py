@@ -86,13 +86,12 @@ def camera_with(size: Sequence[Any], view: Sequence[float], kind: str, d: Sequen
     return camera
 
 
-def pinhole(k: Sequence[float], path: object) -> Sizeless:
-    """Return the camera of K (9,), of pictures without distortion whose size is not written."""
-    return Sizeless(lambda size: camera_with(size, focal_and_centre(k), PLUMB_BOB, (), path))
+def pinhole(view: Sequence[float], path: object) -> Sizeless:
+    """Return the camera of fx, fy, cx, cy, of pictures without distortion and without a size."""
+    return Sizeless(lambda size: camera_with(size, view, PLUMB_BOB, (), path))
 
 
 def _check_count(d: Sequence[float], path: object) -> None:
-    """Raise InputError for a number of coefficients that no program writes for a pinhole."""
     if len(d) in COUNTS or not any(d[2:]):
         return
     if len(d) == 3:
@@ -179,7 +178,7 @@ def read_matrix(data: Data, key: Any, path: object) -> list[float]:
         if model is not None and model.lower() not in (*MODELS, *ROS_MODELS, *NO_DISTORTION):
             raise _not_supported(path, 'the lens model', model, ROS_MODELS)
         raise InputError('E-CALIBRATION-NO-MATRIX',
-                         f'{path}: {key} is no matrix, and has no fx, fy, cx, cy; write those')
+                         f'{path}: {key} is not a matrix, and has no fx, fy, cx, cy; write those')
     k = read_numbers(value, str(key), path, 4, 12, 16, 9)
     if len(k) == 4:
         return [k[0], 0, k[2], 0, k[1], k[3], 0, 0, 1]
@@ -199,10 +198,10 @@ def read_matrix(data: Data, key: Any, path: object) -> list[float]:
 
 def _no_matrix(key: Any, row: str, path: object) -> InputError:
     return InputError('E-CALIBRATION-NO-MATRIX',
-                      f'{path}: {key} is no matrix, as its last row is not {row} (Waymo has fx, '
-                      f'fy, cx, cy, k1, k2, p1, p2, k3 there); write its values by name, as in '
-                      f'{{"fx": 700, "fy": 700, "cx": 640, "cy": 360, "k1": 0, "k2": 0, "width": '
-                      f'1280, "height": 720}}')
+                      f'{path}: {key} is not a matrix, as its last row is not {row} (Waymo has '
+                      f'fx, fy, cx, cy, k1, k2, p1, p2, k3 there); write its values by name, as '
+                      f'in {{"fx": 700, "fy": 700, "cx": 640, "cy": 360, "k1": 0, "k2": 0, '
+                      f'"width": 1280, "height": 720}}')
 
 
 def read_size(width: Any, height: Any, *, path: object) -> tuple[int, int]:
@@ -338,7 +337,6 @@ def no_distortion(data: Data, what: str, cure: str, path: object) -> InputError:
 
 
 def _entries(data: Any) -> Iterator[tuple[Any, Any]]:
-    """Yield the keys and values of a file's data, and of what is in it."""
     if isinstance(data, Mapping):
         yield from data.items()
     for each in (data.values() if isinstance(data, Mapping) else

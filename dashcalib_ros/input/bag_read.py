@@ -39,7 +39,7 @@ from rosbags.rosbag1 import reader as rosbag1
 from rosbags.rosbag2 import storage_mcap, storage_sqlite3
 from rosbags.typesys.msg import normalize_msgtype
 
-from dashcalib_ros.errors import InputError, one_line
+from dashcalib_ros.errors import InputError, Notice, one_line
 from dashcalib_ros.input.decode import ZSTD_MAGIC
 from dashcalib_ros.input.encodings import CDR, ENCODINGS, PROTOBUF, ROS1, message_of
 from dashcalib_ros.input.source import first_of
@@ -78,6 +78,12 @@ UNPACKERS: dict[str, Callable[[], Any]] = {
     'bz2': bz2.BZ2Decompressor}
 
 
+class TooMuchError(apsw.SQLError):
+    """A database has more than a recording has."""
+
+    code = 'E-BAG-TOO-LARGE'
+
+
 def unpack(kind: str, data: bytes, limit: int = CHUNK_BYTES) -> bytes:
     """Return unpacked data, `limit` bytes and those of a chunk at the most.
 
@@ -102,7 +108,6 @@ class _Unpacking:
         self._left = unpacked_limit(path)
 
     def through(self, unpacker: Callable[[bytes, int], bytes], data: bytes) -> bytes:
-        """Return unpacked data, as unpack() does; raises InputError beyond the limit."""
         try:
             plain = unpacker(data, self._left)
         except InputError:
@@ -168,7 +173,7 @@ def limited(database: apsw.Connection) -> None:
     database.limit(apsw.SQLITE_LIMIT_LENGTH, MESSAGE_BYTES)
     database.set_progress_handler(endless, PIECE)
     if list(database.execute(_MADE)):
-        raise apsw.SQLError('it contains more than tables')
+        raise TooMuchError('it contains more than tables')
 
 
 def _whole(database: apsw.Connection) -> None:
@@ -177,14 +182,13 @@ def _whole(database: apsw.Connection) -> None:
     size = Path(database.filename).stat().st_size
     [(contents, topics, names)] = database.execute(_SIZES)
     if max(contents, names) > size or topics > TOPICS:
-        raise apsw.SQLError('its rows contain more than the file')
+        raise TooMuchError('its rows contain more than the file')
 
 
 class _McapReader(storage_mcap.McapReader):
     """rosbags' reader of an MCAP file that has an index; its messages are those of McapFile."""
 
     def read_index(self) -> None:
-        """Read the index; raises InputError beyond limits."""
         if Path(str(self.path)).stat().st_size - self.data_end > INDEX_BYTES:
             raise InputError('E-BAG-INDEX', 'the index is too large')
         super().read_index()
@@ -193,7 +197,6 @@ class _McapReader(storage_mcap.McapReader):
 
     def messages(self, connections: Collection[Connection], *limits: Any
                  ) -> Generator[tuple[Connection, int, bytes], None, None]:
-        """Read all messages; raises InputError where some cannot be read."""
         wanted = {each.id: each for each in connections}
         for _, channel, message in mcap_contents(
                 Path(str(self.path)), refuse, {each.topic for each in connections}):
@@ -214,28 +217,24 @@ class _Ros1Reader(rosbag1.Reader):
     _end = _entries = _index_end = 0
 
     def read_connection(self) -> Connection:
-        """Read a topic; raises InputError beyond limits."""
         assert self.bio is not None
         if Path(str(self.path)).stat().st_size - self.bio.tell() > INDEX_BYTES:
             raise InputError('E-BAG-INDEX', 'the index is too large')
         return super().read_connection()
 
     def read_chunk_info(self) -> rosbag1.ChunkInfo:
-        """Read where a chunk is."""
         info = super().read_chunk_info()
         assert self.bio is not None
         self._index_end = self.bio.tell()
         return info
 
     def read_chunk(self) -> rosbag1.Chunk:
-        """Read a chunk's head; raises InputError where it is a part of the one before."""
         assert self.bio is not None
         if self.bio.tell() < self._end:
             raise InputError('E-BAG-INDEX', 'chunks overlap')
         return super().read_chunk()
 
     def read_index_data(self, pos: int, indexes: dict[int, list[rosbag1.IndexData]]) -> None:
-        """Read where a topic's messages are in a chunk; raises InputError beyond limits."""
         assert self.bio is not None
         head = self.bio.read(INDEX_HEAD)
         self._entries += int.from_bytes(head[-4:], 'little')
@@ -246,7 +245,6 @@ class _Ros1Reader(rosbag1.Reader):
         self._end = self.bio.tell()
 
     def open(self) -> None:
-        """Open the file; its chunks are unpacked within limits."""
         super().open()
         if self._index_end != Path(str(self.path)).stat().st_size:
             self.close()
@@ -259,8 +257,6 @@ class _Ros1Reader(rosbag1.Reader):
 
 
 class _FolderReader(rosbag2.reader.DirectoryReader):
-    """rosbags' reader of a folder with metadata.yaml, within limits."""
-
     STORAGE_PLUGINS: Mapping[str, Any] = {'mcap': _McapReader,
                                           'sqlite3': storage_sqlite3.Sqlite3Reader}
 
@@ -506,7 +502,8 @@ def scan(path: Path, damage: Damage, topics: Collection[str] | None = None) -> I
     elif magic.startswith(_ROS1):
         found_in = scan_bag(path, damage)
     else:
-        damage(f'{path.name} does not have the header of a bag')
+        damage(Notice('E-BAG-NOT-A-RECORDING',
+                      f'{path.name} does not have the header of a bag'))
         return
     yield from (record for record in found_in if topics is None or record.topic in topics)
 
@@ -542,6 +539,10 @@ def has_other_encodings(path: Path) -> bool:
     with path.open('rb') as file:
         return any(isinstance(each, Channel) and each.message_encoding != CDR
                    for each in _summary(file, min(path.stat().st_size, RECORD_BYTES)))
+
+
+def _with_code(damage: str, error: Exception) -> str:
+    return Notice(error.code, damage) if isinstance(error, InputError | TooMuchError) else damage
 
 
 def refuse(damage: str) -> None:
@@ -633,7 +634,6 @@ class McapFile:
                 yield (*wanted[message.channel_id], message)
 
     def _find(self) -> None:
-        """Find chunks, and messages that are in none."""
         indexed, end = [], self._size
         for record in _summary(self._file, min(self._size, RECORD_BYTES)):
             if isinstance(record, Schema | Channel):
@@ -724,8 +724,8 @@ class McapFile:
             try:
                 message = next(self._records(RECORD_BYTES))
             except McapError as error:
-                self._damage(f'{self._path.name} has a message that is too large '
-                             f'({one_line(error)})')
+                self._damage(Notice('E-BAG-TOO-LARGE', f'{self._path.name} has a message that is '
+                                                       f'too large ({one_line(error)})'))
                 continue
             assert isinstance(message, Message)
             yield message
@@ -734,12 +734,12 @@ class McapFile:
         try:
             found = [each for each in self._records_in(chunk) if isinstance(each, Message)]
         except Exception as error:  # also the unpackers' own errors
-            self._damage(f'{self._path.name} has a damaged chunk ({one_line(error)})')
+            self._damage(_with_code(
+                f'{self._path.name} has a damaged chunk ({one_line(error)})', error))
             return []
         return sorted(found, key=lambda each: each.log_time)
 
     def _records_in(self, chunk: _Place) -> list[McapRecord]:
-        """Return what is in a chunk; raises nearly anything where it is damaged."""
         self._file.seek(chunk.place)
         record = next(self._records(RECORD_BYTES))
         if not isinstance(record, Chunk):
@@ -751,7 +751,6 @@ class McapFile:
 
 
 def _indexed(chunk: ChunkIndex) -> _Place:
-    """Return a chunk, of its record in the index."""
     end = chunk.chunk_start_offset + chunk.chunk_length
     offsets = sorted((place, channel) for channel, place in chunk.message_index_offsets.items())
     ends = [place for place, _ in offsets[1:]] + [end + chunk.message_index_length]
@@ -807,11 +806,11 @@ def scan_db3(path: Path, damage: Damage) -> Iterator[Record]:
             for topic, data in database.execute(_ROW, (rows[n], left)):
                 left -= len(data)
                 if left < 0:
-                    raise apsw.SQLError('its rows contain more than the file')
+                    raise TooMuchError('its rows contain more than the file')
                 if topic in topics:
                     yield Record(*topics[topic], times[n], data)
     except apsw.Error as error:
-        damage(f'{path.name}: {one_line(error)}')
+        damage(_with_code(f'{path.name}: {one_line(error)}', error))
     finally:
         database.close()
 
@@ -823,7 +822,7 @@ def scan_bag(path: Path, damage: Damage) -> Iterator[Record]:
         try:
             yield from _bag_messages(file, {}, _Unpacking(path))
         except Exception as error:  # rosbags' errors, and those of what unpacks
-            damage(f'{path.name} is truncated ({one_line(error)})')
+            damage(_with_code(f'{path.name} is truncated ({one_line(error)})', error))
 
 
 def _bag_messages(file: BufferedReader, connections: dict[int, tuple[str, str]],

@@ -16,11 +16,10 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import starmap
 from pathlib import Path, PurePath
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from dashcalib_ros.arrays import Pixels
-from dashcalib_ros.errors import InputError, Notice, counted
+from dashcalib_ros.errors import InputError, Notice, code_of, counted
 from dashcalib_ros.input.bag_read import (
     Damage,
     Record,
@@ -48,11 +47,9 @@ from dashcalib_ros.limits import YAML_BYTES, check_file, parse_yaml, read_text
 
 CURE = ("repair it ('mcap recover', 'ros2 bag reindex', 'sqlite3 .recover', 'rosbag reindex'), "
         'copy it again, or record it again')
-
-
-# reasons that no repair fixes
 NO_CURE = 'check that it is a recording, then copy it again or record it again'
-NO_RECORDING = re.compile('header of a bag|more than|too large|too many')
+# of problems that no repair fixes
+NO_RECORDING = {'E-BAG-NOT-A-RECORDING', 'E-BAG-TOO-LARGE'}
 # types of image_transport's messages that are not read
 VIDEO_TYPES = re.compile('image_transport|theora|h26[45]')
 # problems of files in a message
@@ -153,16 +150,8 @@ def open_bag(path: Path) -> Bag:
     return Bag(files, topics, indexed, tuple(warnings), metadata.begins_ns)
 
 
-class _Metadata(NamedTuple):
-    """What metadata.yaml lists; begins_ns: of packed files."""
-
-    files: tuple[Path, ...] = ()
-    topics: tuple[Topic, ...] = ()
-    begins_ns: Mapping[Path, int] = MappingProxyType({})
-
-
-def _metadata(path: Path) -> _Metadata:
-    """Return the files and topics that metadata.yaml lists, or nothing if it cannot be used."""
+def _metadata(path: Path) -> Bag:
+    """Return the bag that metadata.yaml lists, an empty one where it cannot be used."""
     try:
         text = read_text(path, YAML_BYTES)
         content = parse_yaml(text, str(path))['rosbag2_bagfile_information']
@@ -178,12 +167,11 @@ def _metadata(path: Path) -> _Metadata:
                   int(each['starting_time']['nanoseconds_since_epoch'])
                   for each in content.get('files') or () if each['path'].endswith('.zstd')}
     except (InputError, KeyError, TypeError, ValueError, OverflowError, AttributeError):
-        return _Metadata()
-    return _Metadata(files, _sorted(counts), begins)
+        return Bag((), (), True, ())
+    return Bag(files, _sorted(counts), True, (), begins)
 
 
 def _typed(topics: tuple[Topic, ...], others: tuple[Topic, ...]) -> tuple[Topic, ...]:
-    """Return topics with the types that others of their name have where theirs is missing."""
     types = {topic.name: topic.msgtype for topic in (*others, *topics) if topic.msgtype}
     counts = Counter[tuple[str, str]]()
     for topic in topics:
@@ -202,7 +190,7 @@ def _topics_of(files: tuple[Path, ...], bag: Path) -> tuple[tuple[Topic, ...], b
         indexed &= by_index
     if problems and not counts:
         why = first_of(problems, TOLD)
-        if all(map(NO_RECORDING.search, problems)):
+        if all(code_of(each) in NO_RECORDING for each in problems):
             raise InputError('E-BAG-NOT-A-RECORDING', f'{bag} cannot be read ({why}): {NO_CURE}')
         raise InputError('E-BAG-DAMAGED', f'{bag} cannot be read ({why}): {CURE}')
     return _sorted(counts), indexed
@@ -314,7 +302,6 @@ class BagSource(FrameSource):
 
 
 def _of_video(shot: _Shot, frame: Any) -> _Shot:
-    """Return a shot with the picture that its packet led to."""
     return shot._replace(decode=partial(FramePicture(), frame))
 
 
@@ -349,7 +336,6 @@ def _choose(path: Path, bag: Bag, name: str | None) -> Topic:
 
 
 def _check_readable(path: Path, bag: Bag) -> None:
-    """Raise InputError where a bag without image topics has images all the same."""
     filled = [topic for topic in bag.topics if topic.count]
     if untyped := [topic.name for topic in filled if not topic.msgtype]:
         raise InputError(

@@ -39,11 +39,15 @@ TRANSPORTS = ('compressed', 'ffmpeg', 'foxglove', 'zstd')
 REPAIR = "repair the bag first ('ros2 bag convert', 'mcap recover', 'ros2 bag reindex')"
 
 
+def base_topic(topic: str) -> str:
+    """Return an image topic without the transport that image_transport adds to its name."""
+    base, _, transport = topic.rpartition('/')
+    return base if transport in TRANSPORTS else topic
+
+
 def camera_info_topic(image_topic: str) -> str:
     """Return the camera_info topic that image_transport expects for an image topic."""
-    base, _, transport = image_topic.rpartition('/')
-    base = base if transport in TRANSPORTS else image_topic
-    return f'{base.rpartition("/")[0]}/camera_info'
+    return f'{base_topic(image_topic).rpartition("/")[0]}/camera_info'
 
 
 def first_camera_info(path: Path, topic: str | None = None) -> tuple[str, Any]:
@@ -178,10 +182,7 @@ def new_bag(path: Path) -> Iterator[Writer]:
 
 @contextmanager
 def _new_folder(path: Path, made: bool = True) -> Iterator[Path]:
-    """Give a folder with the last name of a path, which appears there when all went well.
-
-    made: it is there already. Raises OutputError when it exists or cannot be written.
-    """
+    """Give a folder that appears at a path when all went well. made: it is there already."""
     path = path.absolute()
     _check_free(path)
     try:
@@ -216,7 +217,6 @@ def _messages(reader: Reader2, connections: list[Connection], source: str | os.P
 
 
 def _declared(writer: Writer, connection: Connection) -> Connection:
-    """Declare a topic as in the source, with the source's message definition if it has one."""
     ext: Any = connection.ext
     common: dict[str, Any] = {'serialization_format': ext.serialization_format,
                               'offered_qos_profiles': ext.offered_qos_profiles}
@@ -256,7 +256,6 @@ def _opened(source: str | os.PathLike[str], image_topic: str | None) -> Iterator
 
 
 def _checked_topic(source: str | os.PathLike[str], image_topic: str) -> str:
-    """Return the topic of a new camera_info; raises InputError where the bag has others there."""
     topic = camera_info_topic(image_topic)
     wrong = [each.msgtype for each in open_bag(Path(source)).topics
              if each.name == topic and each.msgtype not in CAMERA_INFOS]
@@ -276,7 +275,6 @@ def _check_limits(path: Path) -> None:
 
 
 def _camera_info(c: RosCamera, header: Any) -> bytes:
-    """Return a serialised CameraInfo."""
     store = types_of(Stores.ROS2_JAZZY)
     types: Any = store.types
     fields = {name: np.array(value) if isinstance(value, list) else value

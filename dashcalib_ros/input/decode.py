@@ -211,7 +211,6 @@ def _is_packed(message: Any) -> bool:
 
 
 def _packed_image(message: Any) -> tuple[Any, bytes]:
-    """Return the image, whose data is still packed, and that; raises InputError for damage."""
     data = bytes(message.data)
     try:
         height, width, big, step, length = struct.unpack_from('<IIBII', data)
@@ -224,10 +223,7 @@ def _packed_image(message: Any) -> tuple[Any, bytes]:
 
 
 def _unpacked(message: Any) -> Any:
-    """Return the image of a message of zstd_image_transport; raises InputError for damage.
-
-    That transport packs by gzip, whatever its name says.
-    """
+    """Return the unpacked image: that transport packs by gzip, whatever its name says."""
     image, packed = _packed_image(message)
     check_pixels(image.width, image.height)
     limit = min(image.height * image.step, PICTURE_BYTES) + 1
@@ -241,7 +237,6 @@ def _unpacked(message: Any) -> Any:
 
 
 def _name(message: Any) -> str:
-    """Return a name for messages about a CompressedImage; raises InputError for other formats."""
     name = ' '.join(str(message.format).split())
     if 'compresseddepth' in name.lower():
         raise InputError('E-IMAGE-DEPTH',
@@ -250,7 +245,12 @@ def _name(message: Any) -> str:
         raise InputError('E-IMAGE-VIDEO', f'{name!r} is a video, and one packet of it is not a '
                          f'complete image: set image_transport:=video, or republish it as JPEG '
                          f'(image_transport republish)')
-    return f'{name or "compressed"} image'
+    what = f'{name or "compressed"} image'
+    if (not any(each in what.lower() for each in _FORMATS)
+            and encoded_size(memoryview(message.data)) is None):
+        raise InputError('E-IMAGE-FORMAT', f'the format of {what!r} is not supported: publish or '
+                         f'record it as JPEG or PNG (ros2 run image_transport republish)')
+    return what
 
 
 def decode_file(data: bytes | memoryview, depth: BitDepth | None = None,
@@ -310,10 +310,6 @@ def decode_pixels(data: bytes | memoryview, what: str = 'image', colour: bool = 
 
 def _encoded_size(data: memoryview, what: str) -> tuple[int, int]:
     size = encoded_size(data)
-    if size is None and what.endswith(' image') and not any(
-            each in what.lower() for each in _FORMATS):
-        raise InputError('E-IMAGE-FORMAT', f'the format of {what!r} is not supported: publish or '
-                         f'record it as JPEG or PNG (ros2 run image_transport republish)')
     if size is None:
         raise _damaged(what, len(data))
     check_pixels(*size, what)
@@ -357,10 +353,7 @@ def _damaged(what: str, size: int) -> InputError:
 
 
 def _pixels(message: Any, layout: _Layout, colour: bool) -> Pixels:
-    """Return (height, width, channels), a view of the message where its bytes allow.
-
-    colour: of planar ones all the rows, those of the colours last.
-    """
+    """Return (height, width, channels); colour: of planar ones all rows, the colours last."""
     width, height, step = int(message.width), int(message.height), int(message.step)
     data = np.frombuffer(message.data, np.uint8)
     check_pixels(width, height)

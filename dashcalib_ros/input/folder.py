@@ -96,7 +96,6 @@ class FolderSource(FrameSource):
                 None if self._begin_s is None else self._begin_s * SECOND_NS)
 
     def _turned(self) -> str:
-        """Return how the first picture is turned when it is shown; '' for not at all."""
         from dashcalib_ros.input.decode import turned_text
         with suppress(InputError):  # raised again when it is read
             return turned_text(read_file(self._path / self._names[0], PICTURE_BYTES), '')
@@ -158,10 +157,7 @@ def times_of(path: Path, names: Sequence[str], fps: float | None, stamps: Path |
         raise InputError('E-STAMPS-UNUSED', f'{stamps}: its times cannot be assigned to the '
                          f'{len(names)} images of {path}: write a line for each image, its name '
                          f'and its time in seconds')
-    if listed is not None and (listed.by_name or stamps is not None):
-        return _recorded(path, names, listed.stamps_ns, f'those in {listed.file.name}',
-                         listed.file.name, fps)
-    named = stamps_in(stems)
+    named = None if listed is not None and (listed.by_name or stamps) else stamps_in(stems)
     if named is not None and (named.clear or fps is None):
         return _recorded(path, names, named.ns, f'their names, in {named.unit}',
                          'the images', fps)
@@ -190,10 +186,7 @@ def times_of(path: Path, names: Sequence[str], fps: float | None, stamps: Path |
 
 def _recorded(path: Path, names: Sequence[str], stamps_ns: Sequence[int | None], where: str,
               what: str, fps: float | None) -> Times:
-    """Return the images in the order of their times; those without one are left out.
-
-    where, what: the times are, for messages.
-    """
+    """Return the images that have a time in its order. where, what: it is, for messages."""
     known = sorted(((ns, place) for place, ns in enumerate(stamps_ns) if ns is not None))
     kept = [known[0]] + [b for a, b in pairwise(known) if b[0] > a[0]]
     stamps = [ns for ns, _ in kept]
@@ -228,10 +221,7 @@ def _by_the_second(stems: Sequence[str]) -> tuple[int | None, float | None]:
 
 def _places(path: Path, names: Sequence[str], numbers: Sequence[int | None]
             ) -> tuple[Sequence[int], tuple[Notice, ...]]:
-    """Return the images' places in a drive of evenly spaced ones, and what is to be said.
-
-    Numbers that rise by one step, and then by several, leave out images.
-    """
+    """Return the images' places in an evenly spaced drive: numbers may leave out some."""
     even = range(len(names))
     known = [number for number in numbers if number is not None]
     steps = [b - a for a, b in pairwise(known)]
@@ -255,10 +245,8 @@ TIMES, OTHERS = (re.compile(words, re.IGNORECASE) for words in (
     r'time|stamp|^(?:data|frames?|images?|rgb|color|colour)$',
     r'imu|gps|gnss|oxts|lidar|velo|depth|odom|pose|radar|events?|ground'))
 SUFFIXES = frozenset(('.txt', '.csv', '.tsv', '.times', '.timestamps'))
-# headings of columns: times, and what an image is counted by
+# headings of columns that are times
 TIME_HEADING = re.compile(r'time|stamp|^t$|^sec|^ns', re.IGNORECASE)
-COUNT_HEADING = re.compile(r'^(?:index|idx|id|no|nr|#|n|frame\w*|image\w*|number|count\w*|seq)$',
-                           re.IGNORECASE)
 NUMBER = re.compile(r'[-+]?\d*[.,]?\d+(?:e[-+]?\d{1,3})?|\d+\.', re.IGNORECASE)
 # lists that are looked at
 LISTS = 50
@@ -275,11 +263,7 @@ class _List:
 
 def _listed(path: Path, names: Sequence[str], stems: Sequence[str], given: Path | None = None
             ) -> tuple[_List | None, list[str]]:
-    """Return the list of the images' times, in or beside their folder, and those of no use.
-
-    given: the only one to look at, whatever its name. One that names the images comes before one
-    that has a line for each.
-    """
+    """Return the list of the images' times, and those of no use. given: the only one."""
     unused: list[str] = []
     found: list[_List] = []
     numbers = numbers_in(stems)
@@ -350,7 +334,6 @@ class _Table:
                             []) if first else []
 
     def column(self, column: int) -> list[str]:
-        """Return a column's cells, '' where a line lacks it."""
         return [row[column] if len(row) > column else '' for row in self.rows]
 
     def naming(self, names: Sequence[str], stems: Sequence[str], folder: str
@@ -405,7 +388,6 @@ class _Table:
 
 
 def _is_drive(stamps_ns: Sequence[int | None]) -> bool:
-    """Return whether these may be the times of a drive's images, and not whole seconds."""
     known = sorted(ns for ns in stamps_ns if ns is not None)
     steps = [b - a for a, b in pairwise(known)]
     return (bool(steps) and len(known) >= (1 - LACKING) * len(stamps_ns)

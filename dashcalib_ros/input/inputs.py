@@ -154,7 +154,6 @@ class _Group:
 
 
 def _expanded(text: str) -> _Group:
-    """Return the recordings that an argument names: itself, those in a folder, or a pattern's."""
     _check_recorded(text)
     path = Path(text)
     try:
@@ -209,7 +208,6 @@ def _in_folder(folder: Path) -> _Group:
 
 
 def _joined(groups: Sequence[_Group], topic: str | None, fps: float | None) -> FrameSource:
-    """Open all recordings of all groups as one drive; those that cannot be read are left out."""
     parts: list[FrameSource] = []
     warnings = [Notice('E-FILES-OTHER',
                        f'{group.where}: {counted(group.others, "other file")} skipped')
@@ -275,7 +273,6 @@ def _whole_bags(sources: Sequence[FrameSource]) -> list[FrameSource]:
 
 
 def _all_failed(failures: dict[Path, InputError]) -> InputError:
-    """Return the error for files of which none can be read: each is named, each reason once."""
     reasons: dict[str, list[Path]] = {}
     for path, error in failures.items():
         words = str(error).replace(str(path), '').replace(path.name, '')
@@ -293,7 +290,6 @@ def _as_shells_list(sources: Sequence[FrameSource]) -> bool:
 
 
 def _ordered(sources: list[FrameSource]) -> tuple[list[FrameSource], str]:
-    """Return recordings, which come by name, in their order, and what tells it."""
     maker, *others = {_numbered(source)[0] for source in sources}
     if maker and not others:
         return sorted(sources, key=_numbered), maker
@@ -312,7 +308,6 @@ def _numbered(source: FrameSource) -> tuple[str, str, int, str]:
 
 
 def _cameras(sources: Sequence[FrameSource]) -> int:
-    """Return how many cameras recorded these, as their names tell."""
     by_maker = {camera for *_, camera in map(_numbered, sources)}
     return max(len(by_maker), cameras_named([source.name for source in sources]))
 
@@ -340,7 +335,6 @@ def _told_apart(paths: Sequence[Path]) -> list[str]:
 
 
 def _missing(sources: Sequence[FrameSource]) -> str:
-    """Return in words which files are missing among those that are numbered one by one."""
     parts = [re.split('([0-9]+)', name)
              for name in _told_apart([Path(source.name) for source in sources])]
     differ = [n for n, column in enumerate(zip_longest(*parts)) if len(set(column)) > 1]
@@ -376,10 +370,7 @@ def _open_one(place: Path, topic: str | None, fps: float | None) -> FrameSource:
 
 
 def _opener_of(path: Path) -> Callable[[Path, str | None, float | None], FrameSource] | None:
-    """Return what opens a kind of input (path, topic and rate, as open_frames() has them).
-
-    A folder with a bag in it is no folder of images.
-    """
+    """Return what opens a kind of input; a folder with a bag in it is no folder of images."""
     if fits_bag(path):
         from dashcalib_ros.input.bag_storage import BagSource
         return BagSource
@@ -412,7 +403,6 @@ def is_video(path: Path) -> bool:
 
 
 def _head(path: Path) -> bytes:
-    """Return how a file begins; nothing of what is no file or cannot be read."""
     with suppress(OSError, ValueError):
         if path.is_file():
             with path.open('rb') as file:
@@ -425,7 +415,6 @@ def _has_image_name(path: Path) -> bool:
 
 
 def _check_recorded(text: str) -> None:
-    """Raise InputError for a live stream: a drive is read from its beginning to its end."""
     if re.match(r'[a-z][a-z0-9+.-]+://', text, re.IGNORECASE):
         raise InputError(
             'E-INPUT-STREAM', f'{text} is a stream: record it first (ffmpeg -i {text} -c copy -t '
@@ -524,7 +513,6 @@ class _Place:
         self._recorded = False
 
     def pictures(self, part: FrameSource, reading: Reading) -> Generator[Picture, None, None]:
-        """Yield a source's pictures with the drive's index and stamps."""
         left_ns = 0
         if not part.recorded:  # then it follows directly
             self._first_ns = self._next_ns if self._first_ns is None else self._first_ns
@@ -555,10 +543,7 @@ class _Place:
         self._recorded = part.recorded
 
     def _joint(self, part: FrameSource, stamp_ns: int) -> tuple[int, bool, bool]:
-        """Return how a source follows the one before. stamp_ns: its first one.
-
-        That is: what is added to its stamps, whether there is a gap, whether there may be one.
-        """
+        """Return what is added to its stamps, whether there is a gap, whether there may be one."""
         if not part.recorded:
             return self._next_ns, False, self.index > 0
         if self.index == 0:
@@ -572,10 +557,7 @@ class _Place:
 
 
 def _together(told: Sequence[tuple[str, Sequence[Notice]]]) -> tuple[Notice, ...]:
-    """Return the warnings of all sources; what several say in the same words is said once.
-
-    told: names and warnings.
-    """
+    """Return the warnings of all sources; what several say in the same words is said once."""
     first: dict[str, Notice] = {}
     counts: Counter[str] = Counter()
     for name, warnings in told:

@@ -162,7 +162,6 @@ class SensorStream:
         return self._of_another_time(begin_s, end_s)
 
     def _of_another_time(self, begin_s: float, end_s: float) -> SensorStream:
-        """Return the same with a warning: no image from begin_s to end_s is among its stamps."""
         return replace(self, warnings=(*self.warnings, Notice(
             'E-MOTION-OTHER-DAY', f'the time of recording of the images, '
             f'{time_text(begin_s)}, is not among those of the motion sensors, which begin at '
@@ -277,7 +276,6 @@ def sensor_stream(values: Mapping[str, tuple[Floats, Floats]], what: str,
 
 
 def _nowhere(places: Floats) -> npt.NDArray[np.bool_]:
-    """Return which of (n, 3) latitudes, longitudes and altitudes are what no fix gives."""
     nowhere = (places[:, :2] == 0).all(axis=1) | (np.abs(places[:, :2]) > FARTHEST_DEG).any(axis=1)
     return np.asarray(nowhere)
 
@@ -286,7 +284,6 @@ NAMES = {'rate': 'angular rates', 'speed': 'speeds', 'position': 'positions'}
 
 
 def _cleaned(stamps_s: Floats, values: Floats, kind: str) -> tuple[Samples | None, str]:
-    """Return the usable samples, and what is wrong with them, '' where nothing is."""
     if not len(stamps_s):
         return None, 'the sensor sends none (a GPS without a fix, an IMU without a gyro)'
     if len(stamps_s) > SAMPLES:

@@ -17,7 +17,6 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.errors import InputError, Notice, one_line, shortened
-from dashcalib_ros.input import camm, novatek
 from dashcalib_ros.input.inputs import is_video
 from dashcalib_ros.input.motion import (
     DOUBT_S,
@@ -29,6 +28,7 @@ from dashcalib_ros.input.motion import (
     sensor_stream,
     values_in,
 )
+from dashcalib_ros.input.mp4_sensors import camm_streams, novatek_fixes
 from dashcalib_ros.input.source import by_name, os_error
 from dashcalib_ros.input.times import UNITS as TIME_UNITS
 from dashcalib_ros.input.times import dated_ns, numbers_in, paired, unit_of
@@ -123,7 +123,6 @@ def _first_line(path: Path, what: str) -> str:
 
 
 def _mark(line: str) -> str:
-    """Return what is between the columns of a line."""
     return next((each for each in ';\t,' if each in line), ',')
 
 
@@ -132,7 +131,6 @@ def _names(line: str) -> list[str]:
 
 
 def _log_of(path: Path) -> Mapping[str, str] | None:
-    """Return the headings by our names of a CSV that a known logger has written."""
     try:
         names = set(_names(_first_line(path, str(path))))
     except InputError:
@@ -142,7 +140,6 @@ def _log_of(path: Path) -> Mapping[str, str] | None:
 
 
 def _csvs(files: Sequence[Path], path: Path, columns: Mapping[str, str] | None) -> SensorStream:
-    """Read files of one logger as one stream. path: for messages."""
     values: dict[str, tuple[Floats, Floats]] = {}
     warnings: list[Notice] = []
     for file in files:
@@ -158,7 +155,6 @@ def _csvs(files: Sequence[Path], path: Path, columns: Mapping[str, str] | None) 
 
 def _csv(lines: Iterator[str], path: Path, columns: Mapping[str, str] | None
          ) -> tuple[dict[str, tuple[Floats, Floats]], tuple[Notice, ...]]:
-    """Return the values of a CSV by kind, and what is to be said."""
     head, scales = next(lines, ''), dict[str, float]()
     if head.strip() == GCSV:
         # its orientation is Gyroflow's: the chip's own axes are those of a rotation
@@ -215,7 +211,6 @@ def _csv(lines: Iterator[str], path: Path, columns: Mapping[str, str] | None
 
 
 def _factor(ours: str, theirs: str, scales: Mapping[str, float]) -> float:
-    """Return what a column is to be multiplied by, as its heading or the file's head says."""
     if ours.startswith('gyro'):
         return (scales.get('gscale', 1.0) if scales else
                 np.pi / 180 if DEGREES.search(theirs.lower()) else 1.0)
@@ -280,12 +275,10 @@ class _TrackPoints:
         self._text = '' if self._point is not None and _plain(tag) in ('ele', 'time') else None
 
     def data(self, text: str) -> None:
-        """Take a text, or a part of it."""
         if self._text is not None and len(self._text) < DIGITS:
             self._text += text
 
     def end(self, tag: str) -> None:
-        """Take the end of an element."""
         self._depth -= 1
         if self._point is not None and self._text is not None:
             self._point[_plain(tag)] = self._text
@@ -293,7 +286,8 @@ class _TrackPoints:
         if _plain(tag) == 'trkpt' and self._point is not None:
             point, self._point = self._point, None
             if 'time' in point:
-                self.rows.append(_epoch_s(point['time']))
+                ns = dated_ns(point['time'])
+                self.rows.append(np.nan if ns is None else ns / 10**9)
                 self.rows.extend(_number(point.get(key, '')) for key in ('lat', 'lon', 'ele'))
 
 
@@ -320,16 +314,15 @@ def _gpx(text: str, path: Path) -> SensorStream:
 
 
 def _inside_video(path: Path) -> SensorStream:
-    """Read the gyro or GPS that a camera has written into its video."""
     try:
         check_file(path, f'the video {path}')
-        if inside := novatek.fixes(path):
+        if inside := novatek_fixes(path):
             rows = np.array(inside)
             return replace(sensor_stream({'position': (rows[:, 0], rows[:, 1:4]),
                                           'speed': (rows[:, 0], rows[:, 4:])}, str(path)),
                            doubt_s=DOUBT_S)
-        if found_inside := camm.streams(path):
-            return sensor_stream(found_inside, str(path))
+        if streams := camm_streams(path):
+            return sensor_stream(streams, str(path))
     except OSError as error:
         raise os_error(path, error) from error
     try:
@@ -367,12 +360,6 @@ def _gopro_fixes(block: Mapping[str, Any] | None) -> Iterator[tuple[float, ...]]
     for number, row in enumerate(rows):
         stamp_s = block['TimestampUs'] / 1e6 + number * GOPRO_BLOCK_S / len(rows)
         yield (stamp_s, *(np.array(row[:4], np.float64) / scale).tolist())
-
-
-def _epoch_s(text: str) -> float:
-    """Return s since 1970 of a date and time, in UTC where it names no zone; NaN for none."""
-    ns = dated_ns(text)
-    return np.nan if ns is None else ns / 10**9
 
 
 def _oxts(folder: Path) -> SensorStream:
@@ -479,10 +466,7 @@ def bag_motion(paths: Iterable[Path], chosen: Mapping[str, str | None],
 
 
 def _aligned(bag: Bag, topics: Sequence[str], images: str | None) -> dict[str, float]:
-    """Return what is to be added to stamps, s, of those topics that are not of the images' clock.
-
-    images: their topic; None: the only one. Where it is not known nothing is added.
-    """
+    """Return what to add to stamps, s, of topics of another clock than the images'."""
     shown = [topic.name for topic in bag.topics if topic.is_image and topic.count
              and (images is None or topic.name.strip('/') == images.strip('/'))]
     ours = _late_s(bag, shown[0]) if len(shown) == 1 and topics else None

@@ -47,7 +47,6 @@ def codec_of(message: Any) -> str | None:
 
 
 def _decoder(codec: str) -> Any:
-    """Return a decoder that needs no hardware, where there is one; raises InputError for none."""
     for name in (*SOFTWARE.get(codec, ()), codec):
         with suppress(UnknownCodecError):
             return av.CodecContext.create(name, 'r')

@@ -269,14 +269,13 @@ class FrameSource(ABC):
         return source
 
     def _cut(self, image: Pixels) -> Pixels:
-        """Return the part of an image that is used. Raises InputError where it sticks out."""
         if self.part is None:
             return image
         left, top, width, height = self.part
         if (min(left, top) < 0 or min(width, height) < 1 or left + width > image.shape[1]
                 or top + height > image.shape[0]):
             raise InputError('E-CROP-OUTSIDE',
-                             f'{left},{top},{width},{height} is no part of a picture of '
+                             f'{left},{top},{width},{height} is not a part of a picture of '
                              f'{image.shape[1]}x{image.shape[0]}; write X,Y,W,H in px: the top '
                              f'left corner of the part, and its size')
         return image[top:top + height, left:left + width].copy()
@@ -338,7 +337,6 @@ class FrameSource(ABC):
             raise self._no_image(reading)
 
     def _excerpted(self, reading: Reading) -> Generator[Picture, None, None]:
-        """Yield the pictures from the excerpt's start to its end."""
         first_ns: int | None = None
         with closing(self._pictures(reading, self._start_ns)) as pictures:
             for picture in pictures:

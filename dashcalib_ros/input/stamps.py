@@ -163,7 +163,6 @@ class StampGate:
         return []
 
     def _time(self, header_ns: int, received_ns: int) -> int | None:
-        """Return the image's time, None if it has no stamp or one that is not later."""
         if not self._choose_clock(header_ns):
             self.zero += 1
             return None

@@ -100,7 +100,7 @@ class VideoSource(FrameSource):
             self.contradictions = (Notice(
                 'E-INPUT-CONTRADICTED',
                 f'{path} has {rate:.4g} images per second, but --fps {fps:g} replaces its time '
-                f'stamps: omit --fps unless the time stamps are wrong'),)
+                f'stamps', 'omit --fps unless the time stamps are wrong'),)
         self.length_ns = round(((count or 0) / fps if fps else length_s) * 1e9) or None
 
     @property
@@ -203,10 +203,7 @@ class FramePicture:
 
 
 def _stretch(stream: av.VideoStream, path: Path, warnings: list[Notice]) -> tuple[float, float]:
-    """Return by how much columns and rows are stretched, so that pixels are square.
-
-    The longer side of a pixel is kept: nothing is lost.
-    """
+    """Return by how much columns and rows are stretched; the longer side of a pixel stays."""
     aspect = stream.sample_aspect_ratio or stream.codec_context.sample_aspect_ratio
     ratio = float(aspect) if aspect else 1.0
     if aspect and not 1 / MOST_STRETCH <= ratio <= MOST_STRETCH:
@@ -239,7 +236,6 @@ def _decoded(packet: av.Packet[av.VideoStream]) -> Sequence[av.VideoFrame | None
 
 
 def _time_ns(of: av.VideoFrame | av.Packet[av.VideoStream]) -> int | None:
-    """Return when a picture is shown on the file's clock."""
     time = of.pts if of.pts is not None else of.dts
     return round(time * of.time_base * SECOND_NS) if time is not None and of.time_base else None
 
@@ -258,10 +254,7 @@ def _length_s(container: InputContainer, stream: av.VideoStream) -> float:
 
 
 def _chosen(path: Path, topic: str | None) -> tuple[int | None, list[Notice]]:
-    """Return the number of the stream that is wanted, and what is to be said of the choice.
-
-    Raises InputError where there is no such stream.
-    """
+    """Return the number of the wanted stream, and what is to be said of the choice."""
     with _opened(path) as (container, best):
         streams = _streams(container)
         there = ', '.join(f'{n}: {size_text((each.width, each.height))}'
@@ -280,7 +273,6 @@ def _chosen(path: Path, topic: str | None) -> tuple[int | None, list[Notice]]:
 
 
 def _streams(container: InputContainer) -> list[av.VideoStream]:
-    """Return the streams of a video that are no thumbnails."""
     return [each for each in container.streams.video if not each.disposition & THUMBNAILS]
 
 

@@ -51,17 +51,23 @@ class Condition:
 class Verdict:
     """accepted: use it. weak: look at the sigmas before using it. refused: there is no result.
 
-    reasons: one line each, what is wrong: what to do. cures: what to do, the likeliest to help
-    first. codes: of the reasons, in their order; a code stays when its text is reworded.
-    conditions: those that are not met, in the order of the reasons, then those that are met and
-    that two numbers say.
+    reasons: what is wrong, and what to do, the likeliest to help first. conditions: those that
+    are not met, in the order of the reasons, then those that are met and that two numbers say.
     """
 
     level: Level
-    reasons: tuple[str, ...] = ()
-    cures: tuple[str, ...] = ()
-    codes: tuple[str, ...] = ()
+    reasons: tuple[Notice, ...] = ()
     conditions: tuple[Condition, ...] = ()
+
+    @property
+    def codes(self) -> tuple[str, ...]:
+        """Return the codes of the reasons; a code stays when its text is reworded."""
+        return tuple(reason.code for reason in self.reasons)
+
+    @property
+    def cures(self) -> tuple[str, ...]:
+        """Return what to do, the likeliest to help first."""
+        return tuple(dict.fromkeys(each.remedy for each in self.reasons if each.remedy))
 
     @property
     def accepted(self) -> bool:
@@ -69,7 +75,7 @@ class Verdict:
         return self.level == 'accepted'
 
     @property
-    def told(self) -> tuple[str, ...]:
+    def told(self) -> tuple[Notice, ...]:
         """Return the reasons to show: of a refused result the first, as the others follow."""
         return self.reasons[:1] if self.level == 'refused' else self.reasons
 

@@ -193,7 +193,7 @@ def size_reason(given: Camera, image_size: tuple[int, int], compare: Compare | N
     theirs = f'{given.image_size[0]}x{given.image_size[1]}'
     text = f'it is for {theirs} pictures, and those of the drive have {width}x{height}'
     if width != height and given.image_size == (height, width):
-        return f'{text}: are width and height exchanged, or the pictures turned by 90 degrees?'
+        return f'{text}: are width and height exchanged, or the pictures rotated by 90 degrees?'
     if same_shape(given.image_size, image_size):
         resize = export_command(name, f'--size {width}x{height}')
         if compare is None:
@@ -280,7 +280,6 @@ def with_lines(found: Check, given: Camera, lines: Lines, image_size: tuple[int,
 
 
 def _lines_text(bent: Bend, against: bool, limit: float) -> str:
-    """Return what lines say, and whether it counts; limit: sigmas from which on it may."""
     what = ('contradict its distortion' if against else
             'do not fit its distortion, but too few pixels to decide' if bent.sigmas > limit else
             'lean against its distortion, but not enough to decide'

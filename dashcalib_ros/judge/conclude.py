@@ -246,8 +246,8 @@ def _part(part: Solution | None, whole: Solution, later: int, evidence: Evidence
     from_s, to_s = (float(pick(each)) / 1e9 - evidence.start_s for pick, each in (
         (min, map(min, stamps)), (max, map(max, stamps))))
     if part is None:
-        verdict = Verdict('refused', ('no camera follows from its turns',),
-                          codes=('E-UNDETERMINED',))
+        verdict = Verdict('refused', (
+            Notice('E-UNDETERMINED', 'no camera follows from its turns'),))
     else:
         part = replace(part, px=whole.px)
         verdict = judge(part, config.verdict)
@@ -327,7 +327,6 @@ def straight_lines(solution: Solution | None, evidence: Evidence) -> Bend | None
 
 
 def _mount(solution: Solution, evidence: Evidence, level: str, config: Config) -> Mount | None:
-    """Return how the camera sits on the car; None where that was not asked for."""
     if evidence.straights is None or not config.mount.enabled:
         return None
     return mount_of(evidence.straights, evidence.lines, solution, level,
@@ -335,7 +334,6 @@ def _mount(solution: Solution, evidence: Evidence, level: str, config: Config) -
 
 
 def _speed(evidence: Evidence, config: Config) -> Speed | None:
-    """Return the car's speed, m/s, at stamps of pictures; None where it is not known."""
     constant = config.mount.speed_kmh / 3.6
     if constant:
         return lambda stamps_s: np.full(len(stamps_s), constant)
@@ -349,7 +347,6 @@ def _speed(evidence: Evidence, config: Config) -> Speed | None:
 
 
 def _of_size(mask: Mask | None, size: tuple[int, int]) -> Mask | None:
-    """Return the mask of resized images for images of this (width, height)."""
     if mask is None:
         return None
     row, column = (np.arange(length) * count // length
@@ -358,7 +355,6 @@ def _of_size(mask: Mask | None, size: tuple[int, int]) -> Mask | None:
 
 
 def _field(solution: Solution, image_size: tuple[int, int]) -> LensField | None:
-    """Return the field for the full-size images."""
     if solution.field is None:
         return None
     px = solution.px
@@ -369,7 +365,6 @@ def _field(solution: Solution, image_size: tuple[int, int]) -> LensField | None:
 
 
 def _verdict_without_solution(evidence: Evidence, config: VerdictConfig) -> Verdict:
-    """Return the verdict on a drive that gave no scene."""
     turns = len(evidence.turns)
     if evidence.frames < 2:
         found = Finding('E-FEW-IMAGES', 'refused',
@@ -449,7 +444,6 @@ def _unused_because(turn: TurnId, scene: Scene | None, solution: Solution | None
 
 def _material(scenes: Mapping[TurnId, Scene], solution: Solution | None, evidence: Evidence
               ) -> Material | None:
-    """Return what the report draws; None where none is wanted."""
     if evidence.pictures is None:
         return None
     pictures = dict(evidence.pictures)

@@ -394,7 +394,6 @@ def _px(value: float) -> str:
 
 
 def _blamed(found: Difference) -> Sequence[Way]:
-    """Return the parts of the camera that make it differ, where its parameters do."""
     if found.covariance is None or distance(found.offsets, found.covariance) <= found.limit:
         return ()
     return tuple(found.ways())

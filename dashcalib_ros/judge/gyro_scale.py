@@ -148,7 +148,6 @@ def straight_between(begin_s: float, end_s: float, position: Samples, least_m: f
 
 
 def _line_through(when: Floats, where: Floats) -> Straight:
-    """Return the line through fixes (n, 2), m, at stamps (n,)."""
     away = where - where.mean(axis=0)
     direction = np.linalg.svd(away, full_matrices=False)[2][0]
     direction = direction * np.sign(direction @ (where[-1] - where[0]))
@@ -169,7 +168,6 @@ LEAST_STRAIGHTS, LEAST_TURNED_DEG = 6, 240.0
 
 
 def _fitted(stretches: list[_Stretch]) -> tuple[float, float] | None:
-    """Return the slope of the gyro's angles over the headings', and its sigma."""
     if len(stretches) < LEAST_STRAIGHTS:
         return None
     off_m2, spread_m2, freedom = (np.array([getattr(each.straight, name) for each in stretches])

@@ -53,7 +53,6 @@ def with_known(solution: Solution, config: Config, px: float
 
 
 def _value(text: str, name: str) -> tuple[float, float]:
-    """Return a value and its sigma; a shutter's in s."""
     numbers = [float(number) for number in re.findall(r'\d+\.?\d*', text)]
     if name == 'shutter':
         value, sigma = ([each / 1e3 for each in numbers] + [0.0, 0.0])[:2]

@@ -213,7 +213,6 @@ class Monitor:
         return None if sum(against) > 1 else self.lens
 
     def _lens_change(self) -> Change | None:
-        """Return the change of the lens that the newest turns show, None if they do not."""
         found: Change | None = None
         basis = self._zoom_and_shift()
         for first in reversed(range(len(self.readings))):
@@ -251,7 +250,6 @@ class Monitor:
                 and reading.gain(offsets) / SCATTER > self.config.limit)
 
     def _explains(self, readings: Sequence[Reading]) -> bool:
-        """Return whether the camera in use may be right in turns."""
         _, evidence = self._fitted((), readings, self._zoom_and_shift(), True)
         return not any(map(self._unlike, readings)) and evidence <= self.config.limit
 
@@ -369,7 +367,6 @@ class Monitor:
         return found
 
     def _headings(self, readings: Sequence[Reading]) -> tuple[Floats, Floats]:
-        """Return the mean yaw and pitch of the direction of travel (2,), and its variance."""
         angles = np.array([[each.heading.yaw_deg, each.heading.pitch_deg] for each in readings
                            if each.heading is not None])
         varies = np.array([HEADING_SIGMA_DEG, PITCH_SIGMA_DEG])

@@ -39,10 +39,12 @@ from dashcalib_ros.solve.evidence import (
 )
 from dashcalib_ros.solve.solution import Solution
 
-# cures that several rules have, or that others look for
+# cures that several rules have
 STEADY = 'switch off the stabiliser and fix the zoom, then record another drive'
 MORE_TURNS = 'drive more and sharper turns, as at crossings, in daylight'
 CORNERS = 'drive where there are things to see up to the corners of the picture'
+# the reason for which a camera in use is given up
+MOVES = 'E-PICTURE-MOVES'
 # for what no camera_info holds
 RAYS = 'use `dashcalib export --to rays`'
 
@@ -126,9 +128,7 @@ def verdict_of(findings: Sequence[Finding]) -> Verdict:
     against = [found for found in findings if found.objects]
     levels = {found.level for found in against}
     return Verdict('refused' if 'refused' in levels else 'weak' if levels else 'accepted',
-                   tuple(f'{found.what}: {found.cure}' for found in against),
-                   tuple(dict.fromkeys(found.cure for found in against)),
-                   tuple(found.code for found in against),
+                   tuple(Notice(found.code, found.what, found.cure) for found in against),
                    tuple(found.condition for found in findings))
 
 
@@ -151,7 +151,6 @@ def _found(rule: Rule, grounds: Grounds) -> Finding | None:
 
 
 def _graded(refused: bool, weak: bool) -> Level:
-    """Return the graver level whose condition holds."""
     return 'refused' if refused else 'weak' if weak else 'accepted'
 
 
@@ -233,7 +232,6 @@ def flat_profile(grounds: Grounds) -> Finding:
 
 
 def _has_turn(solution: Solution) -> bool:
-    """Return whether one of the scenes is more than a gentle bend."""
     return any(scene.yaw_deg >= HIDDEN_DEG for scene in solution.scenes)
 
 
@@ -270,7 +268,6 @@ def sigma_too_large(grounds: Grounds) -> Finding:
 
 
 def _relative_sigma(solution: Solution) -> float:
-    """Return the sigma of fx, of fx."""
     return float(solution.sigma[0] / solution.camera.fx)
 
 
@@ -331,7 +328,6 @@ NAMED = 3
 
 
 def _turns(turns: list[TurnId]) -> str:
-    """Return the turns' names, for messages."""
     own = [str(turn.number) for turn in turns if turn.of_this_drive]
     stored = Counter(turn.clip or 'earlier drives' for turn in turns if not turn.of_this_drive)
     names = []
@@ -486,7 +482,7 @@ def _turned_pictures(grounds: Grounds) -> Finding | None:
         return None
     where, turn = TURNED[quarters]
     return Finding('E-TURNED-PICTURES', 'weak',
-                   f'the pictures are turned by about {abs(roll):.0f}°: the road is at their '
+                   f'the pictures are rotated by about {abs(roll):.0f}°: the road is at their '
                    f'{where}',
                    f'turn them upright (a video: ffmpeg -i IN -vf {turn} OUT.mp4), or use --set '
                    f'verdict.max_roll_deg=180 for a camera that is mounted this way',

@@ -176,7 +176,6 @@ CONTRADICTED = 3.0
 
 
 def _own_scale(rate: Samples, position: Samples | None, prior: float) -> _OwnScale:
-    """Return what is known of a gyro's scale. prior: its sigma, without GPS."""
     found = None if position is None else scale_by_gps(rate, position)
     if found is None:
         return _OwnScale(1.0, prior)
@@ -233,7 +232,6 @@ DEGREES = (40.0, 80.0)
 
 
 def _apart(samples: Samples, turns: Sequence[Steps]) -> str:
-    """Return in words how far a sensor's samples are from all turns, '' where they are not."""
     first_s, last_s = float(samples.stamps_s[0]), float(samples.stamps_s[-1])
     begin_s = min((float(turn.stamps_s[0]) for turn in turns), default=first_s)
     end_s = max((float(turn.stamps_s[-1]) for turn in turns), default=last_s)
@@ -688,7 +686,6 @@ class _End:
 
     @property
     def off_m(self) -> float:
-        """Return the RMS distance of the fixes from the straight."""
         return float(np.sqrt(np.mean(self.straight.left**2)))
 
 

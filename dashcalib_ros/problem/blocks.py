@@ -22,6 +22,7 @@ from dashcalib_ros.arrays import Floats, Ints
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.field import TERMS, Field, field_terms
 from dashcalib_ros.camera.mapping import sensitivity, turned
+from dashcalib_ros.camera.rotation import crossed
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.problem.observations import Observed, Stretch, main_axis
 from dashcalib_ros.problem.quadratic import Quadratic
@@ -276,7 +277,6 @@ def bounds_of(camera: Camera, focal_reach: float = FOCAL_BOUND) -> Floats:
 
 
 def _undistorted(camera: Camera) -> Floats:
-    """Return the parameters without distortion and with a centred principal point."""
     return type(camera).centred(camera.image_size, camera.fx).params
 
 
@@ -720,10 +720,10 @@ class Imaging:
         if Readout.name not in self.blocks:
             return Seen(stretch, observed, self, rotated, still, still, still * 0, still * 0, late)
         turning = turning @ self.steering(stretch)
-        by_readout = late[:, None] * (_cross(turning[rows], still) + moving[rows])
+        by_readout = late[:, None] * (crossed(turning[rows], still) + moving[rows])
         turned, local = self.readout_s * turning[rows], still + self.readout_s * by_readout
         if shakes is not None:
-            turned, local = turned + shakes[rows], local + late[:, None] * _cross(
+            turned, local = turned + shakes[rows], local + late[:, None] * crossed(
                 shakes[rows], still)
         return Seen(stretch, observed, self, rotated, still, local, turned, by_readout, late)
 
@@ -756,12 +756,6 @@ Self_ = TypeVar('Self_', bound=Stretch)
 def middle(image_size: tuple[int, int]) -> Floats:
     """Return (2,) the middle of the picture, px."""
     return (np.array(image_size) - 1) / 2
-
-
-def _cross(a: Floats, b: Floats) -> Floats:
-    """Return (n, 3) cross products; np.cross() takes three times as long."""
-    (x, y, z), (p, q, r) = a.T, b.T
-    return np.stack([y * r - z * q, z * p - x * r, x * q - y * p], axis=1)
 
 
 def imaging_with(camera: Camera, stretches: Sequence[Stretch] = ()) -> Imaging:

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Ints
-from dashcalib_ros.camera.rotation import rotation_matrices
+from dashcalib_ros.camera.rotation import crossed, rotation_matrices
 from dashcalib_ros.problem.blocks import ImageBlock, Imaging, Seen
 from dashcalib_ros.problem.observations import Stretch
 from dashcalib_ros.problem.quadratic import Quadratic
@@ -105,12 +105,12 @@ def linearised(seen: Seen, loss_px: float, safe: bool = False) -> Linear:
     if coupled:
         # a point X moves by turning x X + moving, and both follow the poses
         late = local * seen.late
-        still = local + _crossed(late, seen.turning)
-        wide[:, 9:12], wide[:, 12:15] = _crossed(seen.still, late), late
+        still = local + crossed(late, seen.turning.T, -2)
+        wide[:, 9:12], wide[:, 12:15] = crossed(seen.still.T, late, -2), late
     for row, some in zip(observed.keyframes, observed.images, strict=True):
         wide[:, :POINT, some] = stretch.structure.rotations[row].T @ still[:, :, some]
     # a small rotation w of the camera moves the local point by w x (R X)
-    wide[:, 3:6], wide[:, 6:9] = _crossed(seen.rotated, still), still
+    wide[:, 3:6], wide[:, 6:9] = crossed(seen.rotated.T, still, -2), still
     at = POINT + own - sum(block.count for block in images)
     for block in [*images, *shared]:
         np.multiply(block.columns(seen), scale, out=wide[:, at:at + block.size])
@@ -149,13 +149,6 @@ def linearised(seen: Seen, loss_px: float, safe: bool = False) -> Linear:
         follow = imaging.readout_s * each.reshape(POSE * len(used), POSE * len(used))
     # of a matrix and its own transpose only one half is computed
     return Linear(seen, wide, own, by_image, (u @ u.T + v @ v.T)[:-1], points, mixed, follow)
-
-
-def _crossed(a: Floats, b: Floats) -> Floats:
-    """Return (2, 3, n) a x b, where one of both is (n, 3) and the other (2, 3, n)."""
-    x, y, z = a.T if a.ndim == 2 else a.transpose(1, 0, 2)
-    p, q, r = b.T if b.ndim == 2 else b.transpose(1, 0, 2)
-    return np.stack([y * r - z * q, z * p - x * r, x * q - y * p], axis=1)
 
 
 @dataclass(frozen=True)

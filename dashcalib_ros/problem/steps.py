@@ -40,7 +40,7 @@ WORTH = 1e-3
 SETTLING = 3
 # steps in a row that lower nothing
 FAILURES = 5
-# of the cost, in units of the noise: by how much a step of what is shared lowers it at the most
+# of the cost, in units of the noise: by how much a step of what is shared lowers it at most
 # where it is the last one, 0.2 of a sigma
 SETTLED = 0.04
 # eigenvalues below this share of the largest, each parameter in its own unit: of a direction that
@@ -109,7 +109,7 @@ class State:
 class Stepping:
     """How to step, and when to end.
 
-    steps: at the most. unit: px^2 of the noise; None: of the residuals. settled: a step that is
+    steps: at most. unit: px^2 of the noise; None: of the residuals. settled: a step that is
     expected to lower the cost by less, by what is shared, is the last one; tolerance: one that
     changes it by a smaller share. radius: in which the linearisation is trusted at first.
     """
@@ -162,11 +162,9 @@ class _Trust:
 
     @property
     def whole(self) -> bool:
-        """Return whether it is trusted everywhere: steps are not damped then."""
         return self.radius == np.inf
 
     def less(self) -> _Trust:
-        """Return the region after a step that did not lower the cost."""
         return _Trust(min(self.radius / self.shrink, FIRST_RADIUS), 2 * self.shrink)
 
     def more(self, worth: float) -> _Trust:
@@ -246,7 +244,6 @@ class _Step:
                    gain + sum(normal.gain for normal in normals) / unit)
 
     def taken(self, now: S, part: float) -> S:
-        """Return the state after a part of the step."""
         imaging, stretches = now.imaging.moved(part * self.shared), []
         for follow, stretch in zip(self.follows, now.stretches, strict=True):
             stretches.append(moved_by(stretch, follow, part))

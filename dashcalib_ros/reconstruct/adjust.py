@@ -15,7 +15,7 @@ from dashcalib_ros.problem.observations import Stretch
 from dashcalib_ros.problem.steps import FIRST_RADIUS, State, Stepping, optimised
 from dashcalib_ros.reconstruct.scene import Scene, retriangulated
 
-# steps of one adjustment at the most; 60 move fx by 0.03 % at the most, at twice the time
+# steps of one adjustment at most; 60 move fx by 0.03 % at the most, at twice the time
 MAX_ITERATIONS = 12
 # no lens has a coefficient beyond this: the scene has diverged
 MAX_DISTORTION = 1.0
@@ -36,7 +36,7 @@ Free = Literal['nothing', 'first distortion', 'distortion', 'one focal length']
 class Solver:
     """How to adjust. loss_px: scale of the Cauchy loss, about twice the noise of a track.
 
-    tolerance: relative change of the cost that ends it; iterations: steps at the most.
+    tolerance: relative change of the cost that ends it; iterations: steps at most.
     """
 
     loss_px: float = 1.0
@@ -122,7 +122,6 @@ def _projected(scenes: Sequence[Scene], camera: Camera) -> list[Scene]:
 
 
 def _with_structure_of(moved: Stretch, scene: Scene) -> Scene:
-    """Return the scene with the poses and points that were adjusted."""
     found = moved.structure
     return replace(scene, structure=replace(
         scene.structure, rotations=found.rotations, translations=found.translations,

@@ -23,7 +23,7 @@ from dashcalib_ros.reconstruct.scene import Pose
 pycolmap.logging.logtostderr = True
 # px for each radian of the equirectangular camera
 SCALE = 1000.0
-# samples drawn at the least and at the most: drives have many inliers
+# samples drawn at least and at most: drives have many inliers
 RELATIVE_TRIALS = (50, 1000)
 ABSOLUTE_TRIALS = (10, 100)
 # steps of a pose's refinement: the adjustments that follow go on from there

@@ -22,7 +22,7 @@ from dashcalib_ros.reconstruct.chain import chain_scene
 from dashcalib_ros.reconstruct.scene import Profile, Scene, truncated_cost
 from dashcalib_ros.reconstruct.tracks import longest, spread, thinned
 
-# how often a scene that leaves images or much else unexplained is chained anew, at the most
+# how often a scene that leaves images or much else unexplained is chained anew, at most
 COMPLETIONS = 2
 # px^2 per observation; what costs more is chained anew
 GOOD_COST = 1.2

@@ -82,7 +82,6 @@ def _reference_rows(used: Mask, depth: Floats) -> Ints:
 
 
 def _noise_of(image: GreyImage) -> float:
-    """Return the standard deviation of a picture's noise, grey levels."""
     response = cv2.filter2D(image, cv2.CV_16S, NOISE_FILTER)
     # edges, which few pixels are on, do not count in a median; of 16 pixels one is enough
     return mad_sigma(response[::4, ::4].astype(np.float64)) / 6

@@ -25,16 +25,16 @@ SPAN = 3
 # how many such spans two scenes must have in common
 LEAST_SPANS = 2
 # degrees; a span that turns less fits everywhere. The yaw of the same turn in two reconstructions
-# differs by this factor, and by so many degrees, at the most
+# differs by this factor, and by so many degrees, at most
 LEAST_YAW_DEG, YAW_RATIO, SAME_YAW_DEG = 1.0, 1.2, 0.5
 # spans that tell whether an offset is worth comparing all
 PROBES = 3
 # px; tracks as near as that lie on one surface, and those that move alike differ by so much
 NEAR_PX, ALIKE_PX = 8.0, 1.5
 # the share of near tracks that move alike, the mean of three spans: 0.8 to 1 in the same pictures,
-# 0.33 at the most in 100 pairs of other real turns, 0.3 at 4 % another speed through the same bend
+# 0.33 at most in 100 pairs of other real turns, 0.3 at 4 % another speed through the same bend
 LEAST_ALIKE = 0.5
-# tracks of a span that are compared at the most, and how many must be near another
+# tracks of a span that are compared at most, and how many must be near another
 MOST_TRACKS, FEWEST_NEAR = 60, 8
 # of a turn's keyframes; with fewer new ones it is left out: one place counts once
 LEAST_NEW = 0.75
@@ -95,7 +95,6 @@ def _spans(scene: Scene, rows: Ints) -> list[Floats]:
 
 
 def _seen(xy: Floats) -> Floats:
-    """Return the tracks (2, t, 2) that are seen at both ends."""
     return xy[:, np.isfinite(xy[:, :, 0]).all(axis=0)]
 
 
@@ -146,13 +145,11 @@ def _alike(spans: Sequence[Floats], other: Scene, starts: Ints, times: Floats) -
 
 
 def _seconds(scene: Scene) -> Floats:
-    """Return (k,) the keyframes' times since the first."""
     stamps = scene.tracks.stamps_ns
     return np.asarray((stamps - stamps[0]) / 1e9)
 
 
 def _yaw_deg(scene: Scene) -> tuple[Floats, Floats]:
-    """Return the times of the registered keyframes and the yaw there, degrees."""
     return _seconds(scene)[scene.structure.registered], scene.yaws_deg
 
 
@@ -171,7 +168,6 @@ def _places_at(scene: Scene, at: Floats) -> Floats:
 
 
 def _cut(scene: Scene, rows: Mask) -> Scene:
-    """Return the scene with these keyframes only."""
     tracks, structure = scene.tracks, scene.structure
     used = structure.used[rows]
     # a point needs two views

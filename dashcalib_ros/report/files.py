@@ -164,7 +164,6 @@ def output_folder(out_dir: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def _is_ours(path: Path) -> bool:
-    """Return whether a calibration file was written by this package: ours have a verdict."""
     try:
         return load_camera(path).verdict is not None
     except InputError:

@@ -124,7 +124,6 @@ def evidence_of(c: CalibrationData, mask_id: str | None) -> list[Drawing]:
 
 
 def _profile(c: CalibrationData, material: Material, scenes: list[Scene]) -> Drawing:
-    """Return the error that is left at each focal length held fixed, by turn and for all."""
     solution, fx = material.solution, None if c.camera is None else c.camera.fx
     each = [scene.profile for scene in scenes]
     if solution is not None and c.camera is not None:
@@ -158,7 +157,6 @@ def _profile(c: CalibrationData, material: Material, scenes: list[Scene]) -> Dra
 
 
 def _growth(c: CalibrationData, solution: Solution, px: float) -> list[Drawing]:
-    """Return the sigma of fx, in %, with the first turn, with two of them, and so on."""
     assert c.camera is not None
     percent = [100 * sigma * px / c.camera.fx for sigma in sigma_by_count(solution)]
     if not np.isfinite(percent).all() or not percent:
@@ -213,7 +211,6 @@ def _residuals(xy: Floats, residual: Floats, size: tuple[int, int], px: float) -
 
 
 def _coverage(xy: Floats, size: tuple[int, int], mask_id: str | None) -> Drawing:
-    """Return how many observations each part of the picture has."""
     cell, shape = _cells(xy, size)
     count = np.bincount(cell, minlength=shape[0] * shape[1]).reshape(shape)
     height = _height(size)
@@ -274,7 +271,7 @@ def undistorted(image: Pixels, camera: Camera, rectified: str
 
     camera: of images of this size. The grids are of the same rays: paths of an SVG in px, first
     the bent one of the original, then the straight one. Last comes how far the lens moves a
-    point at the most, px, within 75 degrees of its axis.
+    point at most, px, within 75 degrees of its axis.
     """
     height, width = image.shape[:2]
     with np.errstate(all='ignore'):

@@ -25,7 +25,6 @@ from dashcalib_ros.report.wording import (
     PARAMETERS,
     cures,
     number,
-    objections,
     optional,
     parameter_rows,
     run_facts,
@@ -73,8 +72,8 @@ def _unused(c: CalibrationData) -> dict[str, list[str]]:
 def conclusion(verdict: Verdict) -> RenderableType:
     """Return the verdict, coloured, and its reasons; of a refused result the cause."""
     parts: list[RenderableType] = [labelled('verdict', verdict.level)]
-    parts += [Padding.indent(line(f'{what} [{code}]' if code else what), 2)
-              for code, what, _ in objections(verdict)[:len(verdict.told)]]
+    parts += [Padding.indent(line(f'{each.what} [{each.code}]' if each.code else each.what), 2)
+              for each in verdict.told]
     return Group(*parts)
 
 

@@ -40,7 +40,7 @@ ARROW = 9.0
 VIEW, MARGIN, CAMERA = (440, 270), 8, 13.0
 # degrees, as in script.js; 90 is from above
 TILT = 50.0
-# at the most, of points drawn
+# at most, of points drawn
 POINTS = 1500
 # one stroke along all edges of a camera's pyramid, as wide as it is long
 FRUSTUM = np.array([(0, 0, 0), (-.5, -.5, 1), (.5, -.5, 1), (0, 0, 0), (.5, .5, 1), (-.5, .5, 1),
@@ -99,7 +99,6 @@ def _fx_alone(c: CalibrationData) -> dict[TurnId, tuple[float, float]]:
 
 
 def _shares(c: CalibrationData) -> dict[TurnId, float]:
-    """Return each turn's share of the information about fx; none of a refused calibration."""
     solution = c.material.solution if c.material and _fx_alone(c) else None
     return {} if solution is None else leverages(solution)
 

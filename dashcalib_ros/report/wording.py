@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import posixpath
-from itertools import zip_longest
 from shlex import quote
 
 import numpy as np
@@ -177,15 +176,6 @@ def cures(verdict: Verdict) -> tuple[str, ...]:
     return found[:1] if verdict.level == 'refused' else found
 
 
-def objections(verdict: Verdict) -> list[tuple[str, str, str]]:
-    """Return each reason of a verdict: its code, '' where it has none, what is wrong, the cure."""
-    found = []
-    for reason, code in zip_longest(verdict.reasons, verdict.codes, fillvalue=''):
-        cure = next((cure for cure in verdict.cures if reason.endswith(f': {cure}')), '')
-        found.append((code, reason.removesuffix(f': {cure}'), cure))
-    return found
-
-
 def next_steps(c: CalibrationData, folder: str = FOLDER) -> list[str]:
     """Return what to do next, most useful first. folder: where the result is written."""
     file = f'`{quote(posixpath.join(folder, file_of(c.verdict)))}`'
@@ -269,5 +259,5 @@ def optional(value: float | None, digits: int, unit: str = '') -> str:
 
 def conditions(verdict: Verdict) -> tuple[Condition, ...]:
     """Return the conditions of a verdict; of one without any, its reasons."""
-    return verdict.conditions or tuple(Condition(code, what, '', '', False)
-                                       for code, what, _ in objections(verdict))
+    return verdict.conditions or tuple(Condition(each.code, each.what, '', '', False)
+                                       for each in verdict.reasons)

@@ -146,7 +146,7 @@ class Inbox:
             self._filled.notify()
 
     def get(self, wait_s: float) -> Action | None:
-        """Take out what is next; wait for it so long at the most, then return None."""
+        """Take out what is next; wait for it so long at most, then return None."""
         with self._filled:
             if not (self._commands or self._images):
                 self._filled.wait(wait_s)
@@ -273,10 +273,7 @@ class Learner:
         self._now.calibrator.close()
 
     def _serve(self, wait_s: float = 0.0) -> bool:
-        """Do what is next in the inbox; return whether there was something.
-
-        The calibrator calls this while it waits for a child.
-        """
+        """Do what is next in the inbox, also while the calibrator waits for a child."""
         action = self.inbox.get(wait_s)
         if action is None or self._closed:
             return False
@@ -305,7 +302,6 @@ class Learner:
 
     def _push(self, index: int, stamp_ns: int, message: Any, size: tuple[int, int],
               frame_id: str) -> None:
-        """Search an image for turns, and hand it on to who watches."""
         bank = self._now
         try:
             image = mapped_copy(decode_checked(message, size, bank.depth))
@@ -318,7 +314,6 @@ class Learner:
         self._hear(Measured(message.header, status))
 
     def _look(self, bank: _Bank) -> None:
-        """See which turns are built now."""
         try:
             # a camera in use is compared with turns: a stabiliser can hide no turn
             bank.calibrator.scenes.want(self._goal.config.turns.wanted, self._more,
@@ -343,7 +338,6 @@ class Learner:
                                       f'turn'))
 
     def _watch(self, bank: _Bank, camera: NamedCamera, turns: frozenset[TurnId]) -> None:
-        """Compare what is new with the camera in use."""
         if not turns <= bank.read:
             self._read(bank, camera, turns)
         pairs = bank.calibrator.detection.straight_pairs
@@ -493,7 +487,6 @@ def beginning(status: Status) -> str:
 
 
 def _error_text(error: Exception) -> str:
-    """Return an error in one line, with its code, or its type if it is not this project's."""
     if isinstance(error, DashcalibError):
         return coded(error, 500)
     return f'{type(error).__name__}: {one_line(error, 500)}'

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
 
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Header
@@ -12,7 +11,6 @@ from dashcalib_ros.camera import Camera, ros_camera
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import InputError, OutputError, coded
 from dashcalib_ros.formats import calibrated_camera
-from dashcalib_ros.input.decode import read_mask
 from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.report import Calibration, NamedCamera
 from dashcalib_ros.report.wording import mount_text, mounts_text
@@ -58,8 +56,7 @@ class Calibrating:
         self._confirmed = True
         # turns of this drive, with their bank, that were in a contradiction that was counted
         self._counted: frozenset[tuple[int, TurnId]] = frozenset()
-        mask = read_mask(Path(own.mask_file)) if own.mask_file else None
-        self.drive = Drive(endpoints, settings, camera_name, mask, self)
+        self.drive = Drive(endpoints, settings, camera_name, self)
         endpoints.service('~/calibrate', self.drive.calibrate)
         endpoints.service('~/calibrate_now', self.drive.calibrate_now)
         endpoints.service('~/reset', self.reset)
@@ -76,18 +73,13 @@ class Calibrating:
 
     @property
     def _contradictions(self) -> int:
-        """Return how many calibrations in a row contradict the one in use."""
         return self._kept.contradictions if self._kept else 0
 
     def _trusted(self) -> NamedCamera | None:
-        """Return the camera that is published, None if it is stale."""
         return None if self._kept is None or self._stale else self._kept.camera
 
     def _watch(self) -> None:
-        """Let the drive work for the camera in use, or for a first one.
-
-        The first one needs all turns wanted; to check a published one, a few are enough.
-        """
+        """Let the drive work: for a first camera by all turns wanted, to check one by a few."""
         core, trusted = self._core, self._trusted()
         wanted = core.turns.wanted
         self.drive.watch(Goal(
@@ -101,7 +93,6 @@ class Calibrating:
             self._sent += 1
 
     def _load(self) -> None:
-        """Use the file's calibration, if it is an accepted one of this node."""
         try:
             kept = self._store.load()
         except InputError as error:
@@ -119,10 +110,7 @@ class Calibrating:
                        f'turns agree with it')
 
     def _check_writable(self) -> None:
-        """Raise OutputError where no calibration can be kept; one that is there is used, though.
-
-        It may be installed where the node may not write.
-        """
+        """Raise OutputError where no calibration can be kept; an installed one is used, though."""
         try:
             self._store.check_writable()
         except OutputError as error:
@@ -212,7 +200,6 @@ class Calibrating:
             self._drop()
 
     def _count(self, judged: Judgement, calibration: Calibration) -> None:
-        """Keep what a calibration says of the one in use; its file outlives the node."""
         if self._kept is None:
             return
         if judged.contradictions != self._contradictions:
@@ -237,7 +224,6 @@ class Calibrating:
         return self._info
 
     def _show_mount(self, mount: Mount | None, frame_id: str) -> None:
-        """Publish a mounting, and log where it is another one than the last, once."""
         before = self._mounting.mount
         if before and mount and mount.moved_from(before) and 'mount' not in self.drive.changes():
             self._log.info(mounts_text(mount, before))
@@ -245,7 +231,6 @@ class Calibrating:
         self._mounting.show(mount, frame_id)
 
     def _drop(self) -> None:
-        """Use no calibration, as at the start; the file stays where it is."""
         if self._info is not None:
             # K[0] = 0 says that it is uncalibrated (sensor_msgs)
             self._latch(CameraInfo(header=self._header(self._info.header.frame_id)))
@@ -254,7 +239,6 @@ class Calibrating:
         self._watch()
 
     def _retire(self) -> tuple[bool, str]:
-        """Move the file aside; return whether it is out of the way, and a line about it."""
         try:
             return True, self._store.retire()
         except OutputError as error:
@@ -284,7 +268,6 @@ class Calibrating:
             return False, f'not saved: {coded(error)}'
 
     def _warnings(self) -> list[str]:
-        """Return warnings about the file and the topic, for the operator."""
         found = [text for text in (self._store.taken, self._store.given_up) if text]
         if self._contradictions:
             found.append(f'{self._contradictions} of {self._own.contradictions} calibrations in '

@@ -98,7 +98,6 @@ class Mounting:
                            f'{mount_text(mount)}')
 
     def _not_sent(self, mount: Mount, frame: str) -> str:
-        """Return why there can be no transform, and the cure; '' where there can be one."""
         if not frame:
             return 'the images have no frame_id; set camera_frame'
         # a transform has no way to say that a number is not known

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from rclpy.task import Future
@@ -14,7 +13,6 @@ from std_msgs.msg import Header
 
 from dashcalib_ros.errors import InputError, coded
 from dashcalib_ros.formats.ros import camera_of_message
-from dashcalib_ros.input.decode import read_mask
 from dashcalib_ros.judge import Check, with_faults
 from dashcalib_ros.report import NamedCamera, answer_dict
 from dashcalib_ros.ros.background import Goal, Result
@@ -47,8 +45,7 @@ class Checking:
         # why there is no camera
         self._problem = f'no camera_info on {self._given_topic} yet'
         self._answers = endpoints.latched('~/check')
-        mask = read_mask(Path(settings.own.mask_file)) if settings.own.mask_file else None
-        self.drive = Drive(endpoints, settings, camera_name, mask, self)
+        self.drive = Drive(endpoints, settings, camera_name, self)
         endpoints.subscription('camera_info', self._on_info)
         for name, action in (('calibrate', self.drive.calibrate),
                              ('calibrate_now', self.drive.calibrate_now)):
@@ -134,7 +131,6 @@ class Checking:
         return True, 'collecting; the calibration of the driver is not changed'
 
     def _warnings(self) -> list[str]:
-        """Return what keeps the calibration from being checked."""
         if self._given is None:
             return [self._problem]
         if self._fits or self._size is None:
@@ -156,7 +152,6 @@ class Checking:
             'check': found.answer, 'check reasons': '; '.join(found.reasons)}, self._warnings())
 
     def _answer(self) -> Check:
-        """Return the answer of the turns, and the faults that need no turn."""
         return with_faults(self._found, self._given.faults if self._given else ())
 
     @property
@@ -177,7 +172,6 @@ class Checking:
             self._take(message, what == 'changed')
 
     def _take(self, message: CameraInfo, changed: bool) -> None:
-        """Check this calibration from now on."""
         topic = self._given_topic
         if changed:
             self._log.warning(f'the calibration on {topic} has changed: it is checked again')

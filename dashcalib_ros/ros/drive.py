@@ -11,14 +11,14 @@ import queue
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
+from pathlib import Path
 from typing import Any, Protocol
 
 from rclpy.task import Future
 from std_msgs.msg import Float64, Header
 
-from dashcalib_ros.arrays import Mask
 from dashcalib_ros.errors import DashcalibError, InputError
-from dashcalib_ros.input.decode import check_mask
+from dashcalib_ros.input.decode import check_mask, read_mask
 from dashcalib_ros.judge import Monitor, Verdict
 from dashcalib_ros.report.wording import witness_texts
 from dashcalib_ros.ros.background import (
@@ -86,16 +86,16 @@ class Drive:
     in use, None before they do. verdict: of the last calibration.
     """
 
-    def __init__(self, endpoints: Endpoints, settings: Settings, camera_name: str,
-                 mask: Mask | None, role: Role) -> None:
-        """camera_name: in /diagnostics. mask: (h, w), False where pixels are not used.
+    def __init__(self, endpoints: Endpoints, settings: Settings, camera_name: str, role: Role
+                 ) -> None:
+        """camera_name: in /diagnostics.
 
-        Raises ConfigError for a topic's name that is none.
+        Raises ConfigError for a topic's name that is none, InputError for the mask's file.
         """
-        self._endpoints, self._settings, self._role = endpoints, settings, role
-        self._camera_name, self._mask = camera_name, mask
+        self._endpoints, self._camera_name, self._role = endpoints, camera_name, role
         self._log, self._complaints = endpoints.log, endpoints.complaints
         core, own = settings.core, settings.own
+        self._mask = read_mask(Path(own.mask_file)) if own.mask_file else None
         self.held = ''
         self.monitor: Monitor | None = None
         self.verdict: Verdict | None = None
@@ -125,7 +125,8 @@ class Drive:
         self.images = ImageInput(
             endpoints, own, self._video.put if self._video else self._on_image)
         self._goal = Goal(core)
-        self.learner = Learner(self._goal, own.queue_size, self._hear, self._preview.take, mask)
+        self.learner = Learner(self._goal, own.queue_size, self._hear, self._preview.take,
+                               self._mask)
         endpoints.at_end(self.learner.close)
         subscribe_sensors(endpoints, own, self.learner.sensors.add)
         endpoints.timer(PERIOD_S, self._tick)
@@ -160,7 +161,6 @@ class Drive:
         return not refused, refused or 'started: /diagnostics and the log have the result'
 
     def _answer(self, success: bool, text: str) -> None:
-        """Tell those who wait for a calibration what became of it."""
         asked, self._asked = self._asked, []
         for each in asked:
             each.set_result((success, text))
@@ -190,7 +190,6 @@ class Drive:
         self._complaints.failure(kind, error)
 
     def _hear(self, news: News) -> None:
-        """Take news from other threads."""
         action = partial(self._on_news, news)
         if isinstance(news, Measured):
             # one comes with each image: it waits for the next one, as waking up takes time
@@ -294,7 +293,6 @@ class Drive:
                 self.on_result(news)
 
     def _on_watched(self, watched: Watched) -> None:
-        """Take what turns say of the camera in use; each change is logged once."""
         if watched.camera is not self._goal.camera or self.held:
             return
         known = self.changes()
@@ -352,7 +350,6 @@ class Drive:
         self._report(self._role.health())
 
     def _report(self, health: Health) -> None:
-        """Publish /diagnostics, and the state that the overlay shows."""
         images, learner, monitor = self.images, self.learner, self.monitor
         now, wanted = learner.activity.status, self._goal.config.turns.wanted
         clock = self._intake.clock
@@ -395,7 +392,6 @@ class Drive:
             self._endpoints.node, 'camera calibration', self._camera_name, level, message, values))
 
     def _namesakes(self) -> list[str]:
-        """Return that another node has this one's name, in at most one line; log that once."""
         node = self._endpoints.node
         own = node.get_name(), node.get_namespace()
         if node.get_node_names_and_namespaces().count(own) < 2:
@@ -407,7 +403,6 @@ class Drive:
         return [text]
 
     def _level(self, health: Health, warnings: list[str]) -> tuple[bytes, str]:
-        """Return the level of /diagnostics and its message: the worst of what is to be said."""
         silent_s = self._intake.silent_s
         if not self.images.listening:
             return WARN, 'inactive: the node subscribes to no images until it is activated'

@@ -19,7 +19,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from rclpy.utilities import get_rmw_implementation_identifier
 
 from dashcalib_ros.errors import InputError, coded, counted
-from dashcalib_ros.input.bag_write import TRANSPORTS
+from dashcalib_ros.input.bag_write import base_topic
 from dashcalib_ros.input.decode import message_size
 from dashcalib_ros.input.stamps import StampGate
 from dashcalib_ros.ros.background import decode_checked
@@ -282,7 +282,6 @@ class ImageInput:
         self._callback(message)
 
     def _find_video(self) -> None:
-        """Look for the packets of a video."""
         for transport, kind in VIDEOS:
             topic = f'{self.base}{transport}'
             if any(info.topic_type == kind
@@ -299,12 +298,11 @@ class ImageInput:
                 return
 
     def _log_missing(self, topic: str, kind: str) -> None:
-        """Log once that a package is not installed."""
         if self._missing != kind:
             self._missing = kind
             package = kind.partition('/')[0].replace('_', '-')
-            self._log.error(f'{topic} has {kind}, whose package is not installed: '
-                                          f'apt install ros-$ROS_DISTRO-{package}')
+            self._log.error(f'{topic} has {kind}, whose package is not installed: apt install '
+                            f'ros-$ROS_DISTRO-{package}')
 
     def look(self) -> None:
         """Find out who publishes, and follow that: images before the right one are lost."""
@@ -316,8 +314,7 @@ class ImageInput:
             return
         fitting = 'reliable' if all(map(_reliable, infos)) else 'best_effort'
         if fitting != self.reliability:
-            self._log.info(f'{self.topic}: subscribing {fitting}, like its '
-                                         f'publishers')
+            self._log.info(f'{self.topic}: subscribing {fitting}, like its publishers')
             self.stop()
             self.reliability = fitting
             self.start()
@@ -347,11 +344,9 @@ class ImageInput:
             self._logged = None
         elif self._logged is None or now - self._logged >= AGAIN_S:
             self._logged = now
-            self._log.info(f'no images on {self.topic} {since_text(silent_s)}; '
-                                         f'{self._reason()}')
+            self._log.info(f'no images on {self.topic} {since_text(silent_s)}; {self._reason()}')
 
     def _reason(self) -> str:
-        """Return why, as far as it is known, and the cure."""
         infos = self._node.get_publishers_info_by_topic(self.topic)
         if not infos:
             found = self._published()
@@ -374,7 +369,6 @@ class ImageInput:
         return f'its {counted(len(infos), "publisher")} sent nothing: check the camera driver'
 
     def _published(self) -> list[str]:
-        """Return the arguments with which the node gets others' images, for a few topics."""
         node = self._node
         own = {name for name, _ in node.get_publisher_names_and_types_by_node(
             node.get_name(), node.get_namespace())}
@@ -386,25 +380,17 @@ class ImageInput:
 
     def _drawn(self, topic: str) -> bool:
         """Return whether another node like this one draws what is on a topic, for people."""
-        place, _, _ = _base(topic).rpartition('/')
+        place, _, _ = base_topic(topic).rpartition('/')
         return bool(self._node.count_publishers(f'{place}/turn_magnitude'))
 
 
 def _has_a_name(topic: str, kind: str) -> bool:
-    """Return whether messages of a type are images that the node gets by the topic's name."""
     # image_transport knows a compressed topic by its name only
     return kind in KINDS and (kind != COMPRESSED or topic.endswith('/compressed'))
 
 
 def _arguments(topic: str, kind: str) -> str:
-    """Return the arguments with which the node gets the images of a topic."""
-    return f'-r image_raw:={_base(topic)} -p image_transport:={KINDS[kind]}'
-
-
-def _base(topic: str) -> str:
-    """Return a topic without the transport that image_transport adds to its name."""
-    base, _, last = topic.rpartition('/')
-    return base if last in TRANSPORTS else topic
+    return f'-r image_raw:={base_topic(topic)} -p image_transport:={KINDS[kind]}'
 
 
 def since_text(silent_s: float | None) -> str:

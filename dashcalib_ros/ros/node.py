@@ -172,10 +172,7 @@ class CameraNode(LifecycleNode):  # type: ignore[misc]
         return not all(timer.callback_group.can_execute(timer) for timer in self.timers)
 
     def _answering(self, callback: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-        """Return a callback that answers where another fails.
-
-        A client waits for ever for an answer that does not come.
-        """
+        """Return a callback that answers where another fails: its client would wait for ever."""
         def answer(request: Any, response: Any) -> Any:
             try:
                 return callback(request, response)

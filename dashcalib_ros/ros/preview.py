@@ -153,7 +153,6 @@ def overlay(picture: Picture, text: str) -> npt.NDArray[np.uint8]:
 
 
 def _write(drawn: Any, text: str) -> None:
-    """Write a line at the bottom on a dark bar, as large as fits."""
     # cv2's fonts have ASCII only
     text = text.replace('°', ' deg').replace('±', '+-').encode('ascii', 'replace').decode()
     height, width = drawn.shape[:2]

@@ -14,7 +14,7 @@ from typing import Literal
 from dashcalib_ros.errors import counted
 from dashcalib_ros.judge import CalibrationData
 from dashcalib_ros.judge.difference import contradicted
-from dashcalib_ros.judge.verdict import STEADY
+from dashcalib_ros.judge.verdict import MOVES, STEADY
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.report.wording import digits_of
 from dashcalib_ros.ros.settings import NodeConfig
@@ -47,7 +47,7 @@ def judge(new: CalibrationData, complete: bool, published: NamedCamera | None, c
     complete: it had all the turns wanted. published: what is published now, if anything;
     contradictions: how many in a row contradicted that. limits: `better` and `contradictions`.
     """
-    if published is not None and STEADY in new.verdict.cures:
+    if published is not None and MOVES in new.verdict.codes:
         return _contradicted(f'the published one, because the picture moves now: {STEADY}',
                              contradictions, limits, 'give_up')
     if new.verdict.level != 'accepted' or new.camera is None or new.sigma is None:

@@ -288,7 +288,6 @@ class Store:
         return f'{self.path} is now {moved}' if moved else 'there was no file'
 
     def _moved_aside(self) -> str:
-        """Set the file aside; return where it is now, or why it is not."""
         try:
             return f'it is now {set_aside(self.path)}'
         except OutputError as error:
@@ -318,7 +317,6 @@ def _not_written(path: Path, why: Exception | str) -> OutputError:
 
 
 def _check_owner(content: Mapping[str, Any], whose: CameraIdentity) -> None:
-    """Raise InputError for the file of another camera than this node's."""
     name, topic = content.get('camera_name'), content['dashcalib'].get('topic')
     if name != whose.name:
         raise InputError('E-KEPT-OF-OTHER-CAMERA',

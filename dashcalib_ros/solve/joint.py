@@ -206,10 +206,7 @@ def _begun(kind: str, per_turn: Sequence[Scene], config: Config, progress: Progr
 
 def _with_one_focal_length(camera: Camera, per_turn: Sequence[Scene], config: Config
                            ) -> tuple[Estimate, dict[TurnId, Scene]] | None:
-    """Return the optimum with one focal length near a camera, and the turns as adapted to that.
-
-    With a part of the tracks; None where no turn is left.
-    """
+    """Return the optimum with one focal length near a camera, and the turns as adapted to that."""
     measured = {scene.turn: adapted_to(scene, camera, config) for scene in per_turn}
     found = _start(camera, tuple(measured.values()), camera, config, FIRST_REACH)
     lens = found.imaging.lens
@@ -232,7 +229,6 @@ def _explains(found: Estimate) -> float:
 
 def _start(camera: Camera, scenes: tuple[Scene, ...], centred: Camera, config: Config,
            focal_reach: float = FOCAL_BOUND) -> Estimate:
-    """Return the estimate with a lens alone, in the widest model of its kind."""
     wide = type(camera.widened())
     centred = wide.centred(camera.image_size, centred.fx, *centred.params[4:6])
     found = Estimate(imaging_with(camera.widened(), scenes), scenes, config=config)
@@ -296,7 +292,6 @@ def _much_is_left(found: Estimate) -> bool:
 
 def _with_all_tracks(found: Estimate, per_turn: Mapping[TurnId, Scene], config: Config
                      ) -> Estimate:
-    """Return the estimate with all tracks, without turns that the camera does not explain."""
     # a shutter's displacements depend on the points: find these with a generous limit first
     generous = replace(
         found.having(Readout()),
@@ -333,7 +328,6 @@ def _with(found: Estimate, block: Block) -> Estimate:
 
 
 def _finished(found: Estimate) -> Estimate:
-    """Return the optimum of all blocks with all tracks, from a state that is near it."""
     for steps in LAST_STEPS:
         found = optimised(found.retriangulated(), 0.0, steps)
     return found
@@ -358,7 +352,6 @@ def _perhaps_shifted(found: Estimate) -> frozenset[TurnId]:
 
 
 def _posterior(found: Estimate) -> Posterior:
-    """Return what the turns know at their optimum."""
     lens = found.camera
     known = Posterior(
         lens, found.imaging.smooth.sigma**2 * lens_like(lens),

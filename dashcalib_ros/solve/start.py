@@ -129,7 +129,6 @@ def explained_by(scenes: Sequence[Scene], measured: Mapping[TurnId, Scene], came
 
 
 def _rechained(scene: Scene, camera: Camera, config: Config) -> Scene:
-    """Return the scene chained anew with a camera that is nearly right, else triangulated anew."""
     anew = rechain(scene, camera, config)
     return (retriangulate(scene, camera, config.scene) if anew is None
             else _readjusted(anew, camera, config.scene))
@@ -154,7 +153,6 @@ def with_better_poses(scenes: Sequence[Scene], per_turn: Sequence[Scene], camera
 
 
 def _readjusted(scene: Scene, camera: Camera, config: SceneConfig) -> Scene:
-    """Return the scene adjusted to a camera that is nearly right."""
     # the focal length is fixed; the distortion that is found is not used
     solver = Solver(0.01 * camera.image_size[0], MAX_ITERATIONS)
     [moved], _ = adjust([retriangulate(scene, camera, config)], camera, solver, 'distortion')
@@ -246,7 +244,6 @@ def profile_around(scenes: Sequence[Scene], camera: Camera, coarse: Profile,
 
 
 def _probed(scenes: Sequence[Scene], camera: Camera, coarse: Profile, config: Config) -> Profile:
-    """Return profile_around() of these tracks."""
     def settings_at(fixed: Camera) -> SceneConfig:
         least = config.scene.min_angle_deg * camera.fx / fixed.fx
         return replace(config.scene, min_angle_deg=least)

@@ -227,7 +227,6 @@ def _origin(about: Mapping[str, Any]) -> Origin:
 
 
 def _lines(arrays: Arrays, origin: Origin) -> Lines | None:
-    """Return the upright lines; None where the file has none, as those of older versions."""
     if 'lines.points' not in arrays:
         return None
     count = len(arrays['lines.points'])

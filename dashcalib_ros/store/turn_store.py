@@ -12,6 +12,7 @@ import os
 import re
 import secrets
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -86,9 +87,7 @@ class TurnStore:
             except InputError as error:
                 if os.path.lexists(self._folder / name):  # or another process removed it
                     bad.append(str(error))
-                    self._headers[name] = None
                 continue
-            self._headers[name] = of, turn.prominence
             if of.fits(origin):
                 found.append((name, turn))
             else:
@@ -155,7 +154,6 @@ class TurnStore:
             self._remove_excess()
 
     def _names(self) -> list[str]:
-        """Return the names of all files that may be turns."""
         remove_leftovers(self._folder, NAMES)
         try:
             return sorted(path.name for path in self._folder.iterdir() if path.suffix == SUFFIX)
@@ -178,7 +176,7 @@ class TurnStore:
                 f'folder for each camera in turns.store'))
 
     def _read(self, name: str) -> tuple[Origin, StoredTurn]:
-        """Return a file's origin and turn; raises InputError if it is no stored turn."""
+        self._headers[name] = None
         data = read_file(self._folder / name, LARGEST, name)
         try:
             file = decoded(data)
@@ -186,16 +184,13 @@ class TurnStore:
         except ValueError as error:
             raise InputError('E-TURN-FILE',
                              f'{name} cannot be used ({one_line(error)})') from error
+        self._headers[name] = file.origin, turn.prominence
         return file.origin, turn
 
     def _header(self, name: str) -> tuple[Origin, float] | None:
-        """Return a file's origin and prominence, None if it is no stored turn."""
         if name not in self._headers:
-            try:
-                origin, turn = self._read(name)
-                self._headers[name] = origin, turn.prominence
-            except InputError:
-                self._headers[name] = None
+            with suppress(InputError):
+                self._read(name)
         return self._headers[name]
 
     def _write(self, turn: StoredTurn) -> str:

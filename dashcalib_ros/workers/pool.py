@@ -233,7 +233,6 @@ class ScenePool:
                 thread.join(timeout=5)
 
     def _wait(self, ended: Callable[[], bool]) -> None:
-        """Wait until the condition holds, or the pool is closed."""
         while True:
             with self._changed:
                 seen = self._changes
@@ -294,7 +293,6 @@ class ScenePool:
         self._end(call, picture)
 
     def _failed(self, worker: Worker, call: Call, error: Exception) -> None:
-        """Have a call tried again, or give it up."""
         call.failures += 1
         if isinstance(error, WorkerDiedError):
             if call.failures % ATTEMPTS:
@@ -364,7 +362,6 @@ class ScenePool:
         return call
 
     def _pause_s(self) -> float | None:
-        """Return how long until the next call is due, s; None if none waits."""
         now = time.monotonic()
         return min((max(call.not_before - now, 0.0) for call in self._calls if not call.running),
                    default=None)

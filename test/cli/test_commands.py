@@ -76,8 +76,8 @@ class FakeCalibrator:
 
     def outlook(self, progress=None):
         return Outlook(self.frames, self.found, self.yaws_deg, Verdict(
-            self.level, *(() if self.level == 'accepted' else
-                          (('few: drive', 'less: park'), ('drive', 'park'), ('E-A', 'E-B')))),
+            self.level, () if self.level == 'accepted' else
+            (Notice('E-A', 'few', 'drive'), Notice('E-B', 'less', 'park'))),
             (), 0.0)
 
     def close(self):

@@ -15,7 +15,7 @@ from fleet_made import CONFIG, YAWS, Here, clip_of, lens_of, written
 from made_drives import drive, images, smooth, write_bag, write_video
 from solving import remembered
 
-from dashcalib_ros.errors import ConfigError, OutputError
+from dashcalib_ros.errors import ConfigError, OutputError, coded
 from dashcalib_ros.fleet import fuse, storage
 from dashcalib_ros.fleet.batch import batch, cameras_of, problems, shard_of
 from dashcalib_ros.fleet.clips import GONE
@@ -250,7 +250,7 @@ def test_a_full_disk_ends_it_and_publishes_no_refusal(manifest, reference, tmp_p
 def test_a_full_scratch_disk_is_no_fault_of_a_clip(manifest, tmp_path, monkeypatch):
     def full(path):
         raise OSError(errno.ENOSPC, 'No space left on device')
-    monkeypatch.setattr('dashcalib_ros.fleet.clips.local_copy', full)
+    monkeypatch.setattr('dashcalib_ros.fleet.storage.local_copy', full)
     with pytest.raises(OutputError) as caught:
         run(manifest, tmp_path)
     assert caught.value.code == 'E-SCRATCH-FULL'
@@ -298,7 +298,7 @@ def test_clips_that_are_not_there_cost_no_task_and_no_files(tmp_path):
     rows += [Row(2000, '', '', problem='names no clip'), Row(2001, 'a\0b', 'a\0b', 'cam0')]
     cameras, _ = calibrate(rows, tmp_path / 'out', NoWorker())
     found = list(problems(cameras))
-    assert len(found) == 2002 and {why for row, why in found if row.clip} == {GONE}
+    assert len(found) == 2002 and {why for row, why in found if row.clip} == {coded(GONE)}
     assert not any((tmp_path / 'out' / each).exists() for each in ('cameras', 'clips'))
     told = {row['camera']: row for row in csv.DictReader(
         (tmp_path / 'out' / 'cameras.csv').read_text().splitlines())}

@@ -9,6 +9,7 @@ import pytest
 
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import FleetConfig
+from dashcalib_ros.errors import Notice
 from dashcalib_ros.fleet.lens_prior import (
     LensPrior,
     ModelPrior,
@@ -144,7 +145,7 @@ def solved_unit(level='weak', make='acme', sigma=15.0, sound=True):
     covariance = np.diag([sigma, sigma, 2.0, 2.0, 0.01, 0.02])**2
     covariance[0, 1] = covariance[1, 0] = 0.99 * sigma**2
     calibration = Calibration(
-        Verdict(level, () if level == 'accepted' else ('too little yaw',)), (800, 450),
+        Verdict(level, () if level == 'accepted' else (Notice('', 'too little yaw'),)), (800, 450),
         None if level == 'refused' else camera, None, (), 100, 0.2, {}, {}, _config())
     return Solved('cam', make, calibration,
                   Estimate(camera, 4 * covariance, covariance, PictureSigma(9.0, 20.0), 0.2,

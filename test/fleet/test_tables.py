@@ -11,6 +11,7 @@ import pytest
 from browser import BROWSER, found_by_the_browser
 from page_reader import Page
 
+from dashcalib_ros.errors import Notice
 from dashcalib_ros.fleet import tables
 from dashcalib_ros.fleet.clips import ClipResult
 from dashcalib_ros.fleet.manifest import Row
@@ -32,7 +33,7 @@ def rows_at(times_s, focal, sigma=2.0):
     clips = [(Row(n, f'{n}.mp4', f'/{n}.mp4', 'cam', time_s=time_s), result)
              for n, time_s in enumerate(times_s)]
     return clip_rows('cam', 'acme', clips, {
-        f'{n}.mp4': ClipShare(1, '', fx, sigma) for n, fx in enumerate(focal)})
+        f'{n}.mp4': ClipShare(1, fx=fx, fx_sigma=sigma) for n, fx in enumerate(focal)})
 
 
 def drift_of(rows):
@@ -134,14 +135,14 @@ def test_every_dot_of_the_overview_has_a_colour():
 
 def test_the_overview_groups_by_code():
     """Texts differ by names and numbers, in whatever language names are."""
-    shares = {f'{n}.mp4': ClipShare(left_out=f'shows the same as {"abc"[n]}.mp4 [E-CLIP-REPEATED]')
-              for n in range(3)}
+    shares = {f'{n}.mp4': ClipShare.without(
+        Notice('E-CLIP-REPEATED', f'shows the same as {"abc"[n]}.mp4')) for n in range(3)}
     read = ClipResult(file='x.npz', turns=1, scenes=1)
     clips = clip_rows('cam', '', [(Row(n, f'{n}.mp4', f'/{n}.mp4', 'cam'), read)
                                   for n in range(3)], shares)
     cameras = [{**failed_row(name, '', clips), 'reasons': [f'fx of {name} is known to {n} %', 'x'],
                 'reason_codes': ['E-LARGE-SIGMA', f'E-{n}']} for n, name in enumerate('pqrs')]
-    page = overview_html([*cameras, failed_row('t', '', clips, 'why [E-DIED]')], clips)
+    page = overview_html([*cameras, failed_row('t', '', clips, Notice('E-DIED', 'why'))], clips)
     rows = [re.findall('<td>(.*?)</td>', row) for row in re.findall('<tr>(.*?)</tr>', page)]
     counts = {row[0]: row[2] for row in rows if len(row) == 4}
     assert counts == {'E-CLIP-REPEATED': '3', 'E-LARGE-SIGMA': '4', 'E-DIED': '1',

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
-from dashcalib_ros.errors import InputError
+from dashcalib_ros.errors import InputError, Notice
 from dashcalib_ros.formats import load_calibration, result_dict, result_json
 from dashcalib_ros.judge import Verdict
 from dashcalib_ros.judge.calibration import (
@@ -160,7 +160,8 @@ def test_what_is_no_result_is_refused_in_one_line(tmp_path, content, code):
 
 
 def test_codes_of_reasons_are_written_and_read_back(tmp_path):
-    verdict = Verdict('weak', ('one: do', 'two: do'), ('do',), ('E-ONE-CODE', 'E-SECOND-CODE'))
+    verdict = Verdict('weak', (
+        Notice('E-ONE-CODE', 'one', 'do'), Notice('E-SECOND-CODE', 'two', 'do')))
     calibration = make_calibration('weak', verdict=verdict)
     assert strict(result_json(calibration))['reason_codes'] == list(verdict.codes)
     calibration.save(tmp_path)
@@ -169,7 +170,7 @@ def test_codes_of_reasons_are_written_and_read_back(tmp_path):
     old = result_dict(calibration)
     del old['reason_codes']
     (tmp_path / 'result.json').write_text(json.dumps(old))
-    assert load_calibration(tmp_path).verdict.codes == ()
+    assert load_calibration(tmp_path).verdict.codes == ('', '')
 
 
 def test_a_missing_result_is_an_input_error(tmp_path):

@@ -14,7 +14,7 @@ from made_gopro import gopro
 from refused import refused
 
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.input import camm, novatek
+from dashcalib_ros.input import mp4_sensors
 from dashcalib_ros.input.inputs import open_frames
 from dashcalib_ros.input.motion import (
     DEGREE_M,
@@ -625,7 +625,7 @@ def test_the_gps_of_novatek_s_dashcams(tmp_path, place):
     # south of the equator more is farther south: 0.006 minutes a second
     # as far as 4 bytes tell
     np.testing.assert_allclose(np.diff(stream.position.values[:, 1]), -0.0001 * 111_320, atol=1)
-    np.testing.assert_allclose(novatek.fixes(tmp_path / 'a.mp4')[0][1:3], (
+    np.testing.assert_allclose(mp4_sensors.novatek_fixes(tmp_path / 'a.mp4')[0][1:3], (
         -(48 + 7.512 / 60), -(11 + 31 / 60)), atol=1e-5)
     assert not stream.absolute and stream.doubt_s > 0
 
@@ -635,11 +635,11 @@ def test_a_damaged_video_of_novatek_s_is_read_as_far_as_it_goes(tmp_path):
     whole = path.read_bytes()
     for cut in (20, 100, 2000, len(whole) - 100, len(whole) - 3):
         path.write_bytes(whole[:cut])
-        novatek.fixes(path)
+        mp4_sensors.novatek_fixes(path)
     path.write_bytes(whole[:-8] + struct.pack('>II', 2**32 - 1, 2**32 - 1))
-    assert len(novatek.fixes(path)) == 27
+    assert len(mp4_sensors.novatek_fixes(path)) == 27
     path.write_bytes(b'')
-    assert novatek.fixes(path) == []
+    assert mp4_sensors.novatek_fixes(path) == []
 
 
 def camm_video(path, samples, scale=1000, step=100):
@@ -686,23 +686,24 @@ def test_gyro_and_gps_of_a_camm_track(tmp_path):
     np.testing.assert_allclose(stream.position.stamps_s, 0.3 * np.arange(2, 40) + 0.1)
     np.testing.assert_allclose(stream.speed.values, 5.0)
     short = [struct.pack('<2H3d', 0, 5, 48.0, 11.0 + 1e-4 * n, 500.0) for n in range(20)]
-    assert len(camm.streams(camm_video(tmp_path / 'b.mp4', short))['position'][0]) == 20
+    found = mp4_sensors.camm_streams(camm_video(tmp_path / 'b.mp4', short))
+    assert len(found['position'][0]) == 20
 
 
 def test_a_damaged_camm_track_is_read_as_far_as_it_goes(tmp_path):
     path = camm_video(tmp_path / 'a.mp4', [*camm_samples(), b'', b'\0', struct.pack(
         '<2H', 0, 2), struct.pack('<2H', 0, 99)])
-    assert len(camm.streams(path)['rate'][0]) == 40
+    assert len(mp4_sensors.camm_streams(path)['rate'][0]) == 40
     whole = path.read_bytes()
     for cut in range(10, len(whole), 97):
         path.write_bytes(whole[:cut])
-        camm.streams(path)
+        mp4_sensors.camm_streams(path)
 
 
 def test_a_hostile_camm_track_is_bounded_by_its_file(tmp_path):
     path = tmp_path / 'a.mp4'
     path.write_bytes(struct.pack('>I4s', 0, b'moov') + 3000 * struct.pack('>I4s', 0, b'trak'))
-    assert not camm.streams(path)
+    assert not mp4_sensors.camm_streams(path)
     data = camm_video(path, [struct.pack('<2H3f', 0, 2, 0, 0, 1)] * 2).read_bytes()
     most = 2**32 - 1
     for old, new in [(struct.pack('>2I', 0, 2) + 2 * struct.pack('>I', 16),
@@ -713,4 +714,4 @@ def test_a_hostile_camm_track_is_bounded_by_its_file(tmp_path):
         data = data.replace(old, new)
     path.write_bytes(data)
     with path.open('rb') as file:
-        assert 2 <= sum(1 for _ in camm._samples(file, len(data))) <= len(data) // 16
+        assert 2 <= sum(1 for _ in mp4_sensors._camm_samples(file, len(data))) <= len(data) // 16

@@ -14,6 +14,7 @@ from synthetic import LENS, SIZE
 
 from dashcalib_ros.camera import Brown, Fisheye, Radial, misread
 from dashcalib_ros.camera.mapping import apart, as_model
+from dashcalib_ros.errors import Notice
 from dashcalib_ros.judge import Check, Verdict, check, with_faults
 from dashcalib_ros.judge.difference import (
     SURE,
@@ -230,7 +231,7 @@ def test_a_calibration_of_a_part(solution):
 
 
 def test_another_size_needs_no_turns():
-    refused = Verdict('refused', ('no turn was found',))
+    refused = Verdict('refused', (Notice('', 'no turn was found'),))
     found = ask(LENS.resized(2.0, (1600, 900)), None, refused)
     assert found.answer == 'wrong' and found.rms_px is None
     assert '--size 800x450' in found.reasons[0]
@@ -238,7 +239,8 @@ def test_another_size_needs_no_turns():
 
 def test_a_drive_without_a_calibration_of_its_own_cannot_tell(solution):
     for level in ('weak', 'refused'):
-        found = ask(replace(LENS, fx=2 * LENS.fx), solution, Verdict(level, ('too dark',)))
+        verdict = Verdict(level, (Notice('', 'too dark'),))
+        found = ask(replace(LENS, fx=2 * LENS.fx), solution, verdict)
         assert found.answer == 'cannot tell' and 'too dark' in found.reasons[0]
 
 

@@ -24,7 +24,7 @@ from solving import CONFIG, only
 
 from dashcalib_ros.camera.mapping import mapping_error
 from dashcalib_ros.detect import TurnId
-from dashcalib_ros.errors import InputError
+from dashcalib_ros.errors import InputError, Notice
 from dashcalib_ros.input.inputs import open_frames
 from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge import Verdict
@@ -127,8 +127,8 @@ def test_every_objection_is_a_row_that_failed_and_they_come_first(drawn):
 
 def test_a_verdict_of_another_origin_has_its_reasons_as_rows(drawn):
     # the second reason has no code
-    verdict = Verdict('weak', ('the picture is bent: clean', 'old'), ('clean',),
-                      ('E-PICTURE-BENT',))
+    verdict = Verdict('weak', (
+        Notice('E-PICTURE-BENT', 'the picture is bent', 'clean'), Notice('', 'old')))
     assert conditions(verdict) == (
         Condition('E-PICTURE-BENT', 'the picture is bent', '', '', False),
         Condition('', 'old', '', '', False))
@@ -270,7 +270,7 @@ def test_what_turns_say_alone_scatters_about_the_common_result(drawn):
 
 def test_a_refused_page_draws_the_evidence_and_has_no_camera(drawn):
     refused = dataclasses.replace(
-        drawn, verdict=Verdict('refused', ('too little',)), camera=None, sigma=None,
+        drawn, verdict=Verdict('refused', (Notice('', 'too little'),)), camera=None, sigma=None,
         sigma_px=None)
     text = report_html(refused)
     page = Page(text)

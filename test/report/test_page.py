@@ -16,6 +16,7 @@ from rich.console import Console
 
 from dashcalib_ros.camera.field import Field
 from dashcalib_ros.config import Config
+from dashcalib_ros.errors import Notice
 from dashcalib_ros.judge.calibration import LensField
 from dashcalib_ros.judge.verdict import verdict_of, yaw_in_all
 from dashcalib_ros.report import report_html
@@ -67,7 +68,7 @@ def test_text_from_outside_is_escaped():
     calibration = make_calibration(
         'weak', input_name=evil, warnings=(evil,), versions={evil: evil})
     calibration = dataclasses.replace(
-        calibration, verdict=dataclasses.replace(calibration.verdict, reasons=(evil,)))
+        calibration, verdict=dataclasses.replace(calibration.verdict, reasons=(Notice('', evil),)))
     page = Page(report_html(calibration))
     assert page.tags.count('script') == 1
     assert page.text.count('<script>alert(1)</script>') >= 4

@@ -14,7 +14,7 @@ from rich.console import Console
 
 from dashcalib_ros.camera import Fisheye, Radial
 from dashcalib_ros.camera.field import Field
-from dashcalib_ros.errors import DashcalibError
+from dashcalib_ros.errors import DashcalibError, Notice
 from dashcalib_ros.judge import Verdict
 from dashcalib_ros.judge.calibration import LensField, Shutter, Stabiliser
 from dashcalib_ros.report import NamedCamera, compare, report_html
@@ -61,9 +61,8 @@ def test_a_refused_summary_has_no_numbers_of_a_camera():
 
 def test_the_conclusion_is_verdict_reasons_and_what_to_do():
     verdict = Verdict('weak', (
-        '28° of yaw in all turns; at least 60° needed: drive sharper turns',
-        'the zoom changes: fix the zoom', 'without cure'),
-        ('drive sharper turns', 'fix the zoom'))
+        Notice('', '28° of yaw in all turns; at least 60° needed', 'drive sharper turns'),
+        Notice('', 'the zoom changes', 'fix the zoom'), Notice('', 'without cure')))
     assert terminal(conclusion(verdict)).splitlines() == [
             'verdict: weak', '  28° of yaw in all turns; at least 60° needed',
             '  the zoom changes', '  without cure']
@@ -74,8 +73,9 @@ def test_the_conclusion_is_verdict_reasons_and_what_to_do():
 
 
 def test_a_refusal_is_its_cause_and_one_step():
-    verdict = Verdict('refused', ('dark: drive by day', 'few: drive', 'flat: drive'),
-                      ('drive by day', 'drive'), ('E-DARK', 'E-FEW-TURNS', 'E-FLAT-PROFILE'))
+    verdict = Verdict('refused', (
+        Notice('E-DARK', 'dark', 'drive by day'), Notice('E-FEW-TURNS', 'few', 'drive'),
+        Notice('E-FLAT-PROFILE', 'flat', 'drive')))
     assert terminal(conclusion(verdict)).splitlines() == ['verdict: refused', '  dark [E-DARK]']
     assert terminal(next_step(verdict)) == 'next: drive by day'
     refused = make_calibration('refused', verdict=verdict)
@@ -91,7 +91,7 @@ def test_a_refusal_is_its_cause_and_one_step():
 
 
 def test_a_reason_has_its_code():
-    verdict = Verdict('weak', ('few: drive', 'no code'), ('drive',), ('E-FEW-TURNS',))
+    verdict = Verdict('weak', (Notice('E-FEW-TURNS', 'few', 'drive'), Notice('', 'no code')))
     assert terminal(conclusion(verdict)).splitlines()[1:] == ['  few [E-FEW-TURNS]', '  no code']
 
 
@@ -127,7 +127,7 @@ def test_the_verdict_is_coloured_on_a_terminal(level, colour, monkeypatch):
 
 def test_brackets_in_a_reason_are_text_and_no_markup():
     assert '[red]x[/] [/nonsense]' in terminal(
-        conclusion(Verdict('weak', ('[red]x[/] [/nonsense]',))))
+        conclusion(Verdict('weak', (Notice('', '[red]x[/] [/nonsense]'),))))
 
 
 @pytest.mark.parametrize('width', [40, 80])

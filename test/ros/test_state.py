@@ -9,9 +9,10 @@ import pytest
 from dashcalib_ros.camera import Brown, Fisheye, Radial
 from dashcalib_ros.camera.mapping import as_model
 from dashcalib_ros.config import Config
+from dashcalib_ros.errors import Notice
 from dashcalib_ros.judge import Verdict
 from dashcalib_ros.judge.difference import contradicted
-from dashcalib_ros.judge.verdict import STEADY
+from dashcalib_ros.judge.verdict import MOVES, STEADY
 from dashcalib_ros.report import Calibration, NamedCamera
 from dashcalib_ros.ros.settings import NodeConfig
 from dashcalib_ros.ros.state import judge, sigma_text
@@ -24,8 +25,9 @@ OLD = NamedCamera('old', TRUTH, SIGMA, 'accepted')
 
 def calibration(level='accepted', sigma=SIGMA, **changes):
     camera = dataclasses.replace(TRUTH, **changes) if level != 'refused' else None
-    return Calibration(Verdict(level, () if level == 'accepted' else ('few turns',)), (640, 360),
-                       camera, sigma if camera else None, (), 10, 0.3, {}, {}, Config())
+    reasons = () if level == 'accepted' else (Notice('', 'few turns'),)
+    return Calibration(Verdict(level, reasons), (640, 360), camera, sigma if camera else None, (),
+                       10, 0.3, {}, {}, Config())
 
 
 def test_the_first_accepted_one_is_adopted_and_no_other():
@@ -59,7 +61,7 @@ def test_contradictions_in_a_row_give_it_up():
 
 def test_a_stabiliser_that_is_switched_on_gives_it_up():
     weak = calibration('weak')
-    verdict = Verdict('weak', (f'the picture moves: {STEADY}',), (STEADY,))
+    verdict = Verdict('weak', (Notice(MOVES, 'the picture moves', STEADY),))
     moving = dataclasses.replace(weak, verdict=verdict)
     for count in (0, 1):
         judged = judge(moving, True, OLD, count, RULES)

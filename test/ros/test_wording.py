@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
+from dashcalib_ros.errors import Notice
 from dashcalib_ros.judge import TurnSummary, Verdict
 from dashcalib_ros.pipeline import Status
 from dashcalib_ros.report import Calibration
@@ -64,8 +65,8 @@ def test_stored_turns_and_checks_are_told_as_such():
 def test_a_calibration_begins_and_ends_with_a_line():
     assert beginning(status((A, 90.0))) == 'calibrating with 1 turn, 90° of yaw…'
     turn = TurnSummary(10, 0, 20, 1.0, 0.05, 30, 30, True)
-    weak = Calibration(Verdict('weak', ('few turns',)), (320, 240), None, None, (turn,), 10, 0.3,
-                       {}, {}, Config())
+    weak = Calibration(Verdict('weak', (Notice('', 'few turns'),)), (320, 240), None, None,
+                       (turn,), 10, 0.3, {}, {}, Config())
     assert outcome_text(weak, 'few turns') == (
         'a calibration of 1 turn is weak: few turns; it is calculated again with each better turn')
 
