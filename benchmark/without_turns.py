@@ -172,7 +172,7 @@ def main() -> None:
     parser.add_argument('--seconds', type=float, default=10.0)
     parser.add_argument('--pieces', type=int, default=8, help='of each drive, at most')
     parser.add_argument('--spoilt', nargs='*', choices=SPOILT, default=[], metavar='NAME',
-                        help='of ' + ', '.join(SPOILT))
+                        help='of ' + ', '.join(SPOILT).replace('%', '%%'))
     args = parser.parse_args()
     path = args.out / 'without_turns.json'
     rows = load(path)
