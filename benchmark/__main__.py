@@ -54,6 +54,8 @@ PARTS = (
     Part('lines', 60, 'straight lines as a check of the distortion; after `check`'),
     Part('accuracy', 240, 'errors, sigmas, false accepts, refusals: rendered and recorded drives'),
     Part('population', 75, 'random dashcams: accepted, rays off, error over sigma, readouts'),
+    Part('spoilt_tracks', 30, 'two turns whose pictures wander or are stretched: accepted and '
+         'wrong; after `population`'),
     Part('real', 60, 'recorded drives: all combinations of turns, against poses, boards and gyro'),
     Part('without_turns', 20, 'pieces of real drives without a sharp turn, with and without '
          'knowing that there is no stabiliser'),
