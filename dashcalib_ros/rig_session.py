@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Mask
-from dashcalib_ros.camera import Camera
+from dashcalib_ros.camera.mapping import apart, as_model
 from dashcalib_ros.camera.rotation import rotation_vectors
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import InputError, Notice
@@ -34,6 +34,8 @@ from dashcalib_ros.rig.placed import (
     PlacedCamera,
     RigCalibration,
     base_camera,
+    base_doubts,
+    lens_doubts,
     not_placed,
     placed,
     why_not_aligned,
@@ -136,24 +138,29 @@ def rig_of_drives(drives: Mapping[str, Recording], base: str | None = None,
     metres = _metres(learned[base])
     problem = problem_of(paths, base, kept, metres)
     best = solved(problem) if problem.pairs else None
-    calibrations = {name: each.calibration if best is None else _refined(each, best, name)
-                    for name, each in learned.items()}
-    levels = {name: each.calibration.verdict.level for name, each in learned.items()}
+    doubts = {name: lens_doubts(name, each.calibration.verdict.level)
+              for name, each in learned.items()}
     cameras: dict[str, PlacedCamera] = {}
     witness: Mapping[tuple[str, str], Epipolar] = {}
     if best is not None:
-        witness, doubts = _witnessed(learned, best, matches)
+        for name in best.problem.lenses:
+            learned[name], moved = _refined(learned[name], best, name)
+            doubts[name] += moved
+        witness, contradicted = _witnessed(learned, best, matches)
+        doubts = {name: (*each, *contradicted.get(name, ())) for name, each in doubts.items()}
     for name in drives:
         if name == base:
-            cameras[name] = base_camera(place(name), levels[name])
+            cameras[name] = base_camera(place(name), doubts[name])
         elif best is None or name not in best.problem.places:
             cameras[name] = not_placed(place(name), why_not_aligned(
                 name, base, turned[name], len(found[name].scenes)))
         else:
             cameras[name] = placed(
-                name, place(name), levels[name], best, metres is not None,
-                learned[name].start_s - learned[base].start_s, config.rig, doubts.get(name, ()))
-    return Rig(RigCalibration(base, cameras, witness), calibrations)
+                name, place(name), best, metres is not None,
+                learned[name].start_s - learned[base].start_s, config.rig,
+                (*doubts[name], *base_doubts(name, base, doubts[base])))
+    return Rig(RigCalibration(base, cameras, witness),
+               {name: each.calibration for name, each in learned.items()})
 
 
 def _learn(name: str, drive: Recording, config: Config, observer: Observer) -> Learned:
@@ -291,9 +298,9 @@ def _witnessed(learned: Mapping[str, Learned], best: Solved,
     for (a, b), pairs in matches.items():
         if not pairs or not {a, b} <= best.problem.places.keys():
             continue
-        cameras = [_lens(learned[name], best, name) for name in (a, b)]
-        rays, xy = rays_of(cameras, pairs, [learned[name].solution.field  # type: ignore[union-attr]
-                                            for name in (a, b)])
+        solutions = [solution for name in (a, b) if (solution := learned[name].solution)]
+        cameras = [solution.camera for solution in solutions]
+        rays, xy = rays_of(cameras, pairs, [solution.field for solution in solutions])
         across = best.problem.places[b].rotation @ best.problem.places[a].rotation.T
         scale = learned[a].scale.px
         held = fitted(rays, across, cameras[0].fx)
@@ -322,24 +329,27 @@ def _contradicted(free: Fitted, across: Floats, best: Solved, a: str, b: str) ->
     return float(np.linalg.norm(away)) if beyond.any() else 0.0
 
 
-def _lens(each: Learned, best: Solved, name: str) -> Camera:
-    """Return a camera's lens as the rig has it, of the resized pictures."""
-    assert each.solution is not None
-    wide = each.solution.camera.widened()
-    return wide.with_params(wide.params + best.problem.lenses[name][:-1])
+def _refined(each: Learned, best: Solved, name: str) -> tuple[Learned, tuple[Notice, ...]]:
+    """Return what a drive gave with the lens that the rig's rotations go with, and no doubts.
 
-
-def _refined(each: Learned, best: Solved, name: str) -> Calibration:
-    """Return a camera's calibration with the lens that the rig's rotations go with."""
-    calibration, where = each.calibration, best.problem.where.get(('lens', name))
-    if calibration.camera is None or where is None:
-        return calibration
-    camera = _lens(each, best, name).resized(each.scale.px, calibration.image_size)
-    units = camera.units(each.scale.px)
-    covariance = best.covariance[where, where][:-1, :-1] * np.outer(units, units)
-    return replace(
-        calibration, camera=camera, covariance=covariance, picture_covariance=covariance,
-        sigma=dict(zip(camera.names(), np.sqrt(np.diag(covariance)).tolist(), strict=True)))
+    Verdict and sigma are of the camera's own lens, and nothing else judges the rig's: where that
+    is farther off than by this sigma, the own one stays, and a doubt says so.
+    """
+    calibration, own, px = each.calibration, each.solution, each.scale.px
+    if calibration.camera is None or calibration.sigma_px is None or own is None:
+        return each, ()
+    wide = own.camera.widened()
+    camera = as_model(wide.with_params(wide.params + best.problem.lenses[name][:-1]),
+                      type(own.camera)).resized(px, calibration.image_size)
+    away = apart(camera, calibration.camera)
+    if away is None or away.rms > calibration.sigma_px.rms:
+        return each, (Notice(
+            'E-RIG-LENS-APART', f'{name}: the rig asks for another lens than the one that its own '
+            f'turns show{"" if away is None else f", by {away.rms:.1f} px over the picture"}: '
+            f'check that the camera was not moved during the drive, or drive more turns'),)
+    written = replace(own.written, camera=camera.resized(1 / px, own.camera.image_size))
+    return replace(each, calibration=replace(calibration, camera=camera),
+                   solution=replace(own, written=written)), ()
 
 
 def _metres(each: Learned) -> Metres | None:

@@ -90,12 +90,26 @@ class RigCalibration:
         return all(camera.verdict == 'accepted' for camera in self.cameras.values())
 
 
-def base_camera(calibration: str, level: Level) -> PlacedCamera:
-    """Return the base, which sits at its own place."""
+def lens_doubts(name: str, level: Level) -> tuple[Notice, ...]:
+    """Return why a camera's lens keeps its rotation from being accepted; nothing where none."""
+    return () if level == 'accepted' else (Notice(
+        'E-RIG-LENS', f'{name}: its lens is {level}, so its rotation is weak at best: drive turns '
+        f'in which it sees more'),)
+
+
+def base_doubts(name: str, base: str, doubts: Sequence[Notice]) -> tuple[Notice, ...]:
+    """Return why the base keeps a camera's rotation against it from being accepted."""
+    return () if not doubts else (Notice(
+        'E-RIG-BASE', f'{name}: the lens of {base}, against which it is placed, is not accepted: '
+        f'choose another --base, or see what {base} needs'),)
+
+
+def base_camera(calibration: str, doubts: Sequence[Notice] = ()) -> PlacedCamera:
+    """Return the base, which sits at its own place. doubts: about its lens."""
     zero: Three = (0.0, 0.0, 0.0)
     sure: Sights = ('accepted', 'accepted', 'accepted')
-    return PlacedCamera(calibration, 'weak' if level == 'refused' else 'accepted', zero, zero,
-                        zero, zero, 0.0, 0.0, Visible(sure, sure, 'accepted'))
+    return PlacedCamera(calibration, 'weak' if doubts else 'accepted', zero, zero, zero, zero, 0.0,
+                        0.0, Visible(sure, sure, 'accepted'), tuple(doubts))
 
 
 def not_placed(calibration: str, reason: Notice) -> PlacedCamera:
@@ -120,19 +134,19 @@ def why_not_aligned(name: str, base: str, found: Aligned | None, scenes: int) ->
                   f'both clips are of one drive and one car')
 
 
-def placed(name: str, calibration: str, level: Level, solved: Solved, metric: bool,
-           clock: float, limits: RigConfig, doubts: Sequence[Notice] = ()) -> PlacedCamera:
+def placed(name: str, calibration: str, solved: Solved, metric: bool, clock: float,
+           limits: RigConfig, doubts: Sequence[Notice] = ()) -> PlacedCamera:
     """Return where a camera sits.
 
-    level: of its lens. metric: whether metres are known. clock: s by which its stamps begin after
-    the base's. doubts: what else keeps it from being accepted.
+    metric: whether metres are known. clock: s by which its stamps begin after the base's. doubts:
+    what keeps it from being accepted, whatever its sigmas.
     """
     place, groups = solved.problem.places[name], solved.own[name]
     sigma = solved.sigma(name)[:7] * np.r_[np.degrees(np.ones(3)), np.ones(4)]
     sigma = np.hypot(sigma, STRETCH / np.sqrt(max(len(groups), 1)))
     apart = solved.disagreement(name)[:7] > DISAGREE
     most = np.repeat([limits.rotation_deg, limits.translation_m, limits.clock_s], (3, 3, 1))
-    alone = len(groups) < LEAST_STRETCHES or level == 'refused' or bool(doubts)
+    alone = len(groups) < LEAST_STRETCHES or bool(doubts)
     sights: list[Sight] = []
     for value, limit, differs in zip(sigma, most, apart, strict=True):
         if value > WEAK * limit:
@@ -153,7 +167,7 @@ def placed(name: str, calibration: str, level: Level, solved: Solved, metric: bo
         _three(np.degrees(rotation_vectors(place.rotation[None])[0])), _three(sigma[:3]),
         _three(place.translation_m) if metric else None,
         _three(sigma[3:6]) if metric else None, place.late_s + clock, float(sigma[6]), visible,
-        (*doubts, *_reasons(name, visible, len(groups), level, apart, sigma, metric)))
+        (*doubts, *_reasons(name, visible, len(groups), apart, sigma, metric)))
 
 
 def _three(values: Floats) -> Three:
@@ -161,13 +175,10 @@ def _three(values: Floats) -> Three:
     return x, y, z
 
 
-def _reasons(name: str, visible: Visible, stretches: int, level: Level, apart: Mask,
-             sigma: Floats, metric: bool) -> tuple[Notice, ...]:
+def _reasons(name: str, visible: Visible, stretches: int, apart: Mask, sigma: Floats,
+             metric: bool) -> tuple[Notice, ...]:
     """Return what is not accepted, and what would show it."""
     found = []
-    if level == 'refused':
-        found.append(Notice('E-RIG-LENS', f'{name}: its lens is refused, so its rotation is weak '
-                            f'at best: drive turns in which it sees more'))
     if stretches < LEAST_STRETCHES:
         found.append(Notice('E-RIG-ONE-STRETCH', f'{name}: one stretch alone shows where it sits, '
                             f'and nothing confirms it: drive more turns'))

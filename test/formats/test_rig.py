@@ -19,7 +19,7 @@ from dashcalib_ros.rig.witness import Epipolar
 
 SURE = ('accepted', 'accepted', 'accepted')
 RIG = RigCalibration('front', {
-    'front': base_camera('front/result.json', 'accepted'),
+    'front': base_camera('front/result.json'),
     'left': PlacedCamera('left/result.json', 'accepted', (1.0, 70.0, -2.0), (0.05, 0.06, 0.04),
                          (0.5, 0.0, -0.2), (0.02, 1.0, 0.02), 0.03, 0.001,
                          Visible(SURE, ('accepted', 'not visible', 'accepted'), 'accepted'),

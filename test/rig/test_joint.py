@@ -12,7 +12,13 @@ from dashcalib_ros.camera.rotation import rotation_matrices, rotation_vectors
 from dashcalib_ros.config import RigConfig
 from dashcalib_ros.rig.joint import Solved, solved
 from dashcalib_ros.rig.paths import CameraPaths
-from dashcalib_ros.rig.placed import placed, why_not_aligned
+from dashcalib_ros.rig.placed import (
+    base_camera,
+    base_doubts,
+    lens_doubts,
+    placed,
+    why_not_aligned,
+)
 from dashcalib_ros.rig.start import aligned, problem_of
 
 CAMERAS = {
@@ -71,24 +77,35 @@ def test_a_rotation_about_the_vertical_is_known_no_better_than_the_lenses():
 def test_a_flat_road_shows_no_height_and_no_metres_without_a_speed():
     best, _ = rig_of(yaws=(85.0, -75.0))
     assert best.sigma('rear')[4] > 3 * best.sigma('rear')[[3, 5]].max()
-    found = placed('rear', 'rear/result.json', 'accepted', best, True, 0.0, RigConfig())
+    found = placed('rear', 'rear/result.json', best, True, 0.0, RigConfig())
     assert found.visible.rotation == ('accepted',) * 3 and found.verdict == 'accepted'
     assert found.translation_m is not None and abs(found.translation_m[2] + 2.0) < 0.05
     best, _ = rig_of(yaws=(85.0, -75.0), metres=None)
-    found = placed('rear', 'rear/result.json', 'accepted', best, False, 0.0, RigConfig())
+    found = placed('rear', 'rear/result.json', best, False, 0.0, RigConfig())
     assert found.translation_m is None and found.verdict == 'accepted'
     assert 'E-RIG-NO-METRES' in [reason.code for reason in found.reasons]
 
 
 def test_one_stretch_or_a_refused_lens_is_weak():
     best, _ = rig_of(yaws=(85.0,))
-    found = placed('rear', '', 'accepted', best, True, 0.0, RigConfig())
+    found = placed('rear', '', best, True, 0.0, RigConfig())
     assert found.verdict == 'weak'
     assert 'E-RIG-ONE-STRETCH' in [reason.code for reason in found.reasons]
     best, _ = rig_of(yaws=(85.0, -75.0))
-    found = placed('rear', '', 'refused', best, True, 0.0, RigConfig())
-    assert found.verdict == 'weak' and found.rotation_deg is not None
-    assert [reason.code for reason in found.reasons] == ['E-RIG-LENS']
+    assert not lens_doubts('rear', 'accepted') and not base_doubts('rear', 'front', ())
+    for doubts, code in ((lens_doubts('rear', 'refused'), 'E-RIG-LENS'),
+                         (base_doubts('rear', 'front', lens_doubts('front', 'weak')),
+                          'E-RIG-BASE')):
+        found = placed('rear', '', best, True, 0.0, RigConfig(), doubts)
+        assert found.verdict == 'weak' and found.rotation_deg is not None
+        assert [reason.code for reason in found.reasons] == [code]
+
+
+@pytest.mark.parametrize('level', ['weak', 'refused'])
+def test_a_base_is_no_surer_than_its_lens(level):
+    found = base_camera('front/result.json', lens_doubts('front', level))
+    assert found.verdict == 'weak' and [each.code for each in found.reasons] == ['E-RIG-LENS']
+    assert base_camera('front/result.json').verdict == 'accepted'
 
 
 def test_a_camera_that_was_moved_between_two_turns_is_not_accepted():
@@ -102,7 +119,7 @@ def test_a_camera_that_was_moved_between_two_turns_is_not_accepted():
         paths['rear'].scenes[0], replace(moved, trajectory=trajectory)))
     found = {'rear': aligned(paths['rear'], paths['front'])}
     best = solved(problem_of(paths, 'front', found, speed))
-    result = placed('rear', '', 'accepted', best, True, 0.0, RigConfig())
+    result = placed('rear', '', best, True, 0.0, RigConfig())
     assert result.verdict != 'accepted'
     assert 'E-RIG-DISAGREE' in [reason.code for reason in result.reasons]
 
