@@ -25,9 +25,8 @@ from dashcalib_ros.input.inputs import Paths
 from dashcalib_ros.input.motion import speeds_of
 from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.pipeline import Calibrator
-from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.report import Calibration
-from dashcalib_ros.rig.dense import retraced
+from dashcalib_ros.rig.dense import Retraced, retraced
 from dashcalib_ros.rig.joint import Solved, solved
 from dashcalib_ros.rig.paths import CameraPaths, camera_paths, coarse_paths, ordered
 from dashcalib_ros.rig.placed import (
@@ -255,14 +254,14 @@ class _Again:
             scene = ordered(each.solution)[n]
             calls[name, n] = pool.begin(
                 retraced, list(frames.values()), scene, each.solution, self._config, each.valid)
-        scenes: dict[str, list[Scene]] = {name: [] for name in self._late}
+        stretches: dict[str, list[Retraced]] = {name: [] for name in self._late}
         for number, ((name, _), call) in enumerate(calls.items()):
             observer.show('retracing the stretches that cameras share', number / len(calls))
-            scene = pool.result(call)
-            if scene is not None:
-                scenes[name].append(scene)
+            stretch = pool.result(call)
+            if stretch is not None:
+                stretches[name].append(stretch)
         found = {}
-        for name, theirs in scenes.items():
+        for name, theirs in stretches.items():
             each = self._learned[name]
             if each.solution is not None:
                 found[name] = camera_paths(name, each.solution, theirs, each.start_s)

@@ -242,16 +242,10 @@ def normal_equations(linear: Linear, variance: float = 1.0, kept: Sequence[str] 
     first = np.concatenate([extras[name] for name in gone])
     rest = np.concatenate([*(extras[name] for name in kept if name in extras),
                            np.arange(own * len(linear.images), len(whole))])
-    inner, right = whole[np.ix_(first, first)], whole[np.ix_(first, rest)]
-    at = 0
-    for name in gone:
-        place = slice(at, at := at + len(extras[name]))
-        if name != 'pose':
-            block = linear.imaging.blocks[name]
-            assert isinstance(block, ImageBlock)
-            precision, off = block.prior_of(linear.stretch)
-            inner[place, place] += variance * precision
-            right[place, -1] -= variance * (precision @ off)
+    precision, off = _priors(linear, gone)
+    inner = whole[np.ix_(first, first)] + variance * precision
+    right = whole[np.ix_(first, rest)]
+    right[:, -1] -= variance * off
     solved = _pose_solution(inner, right, linear.stretch)
     left = whole[np.ix_(rest[:-1], rest)] - right[:, :-1].T @ solved
     size, places = len(left), {}
@@ -279,14 +273,33 @@ class PosesGivenShared:
 
 
 def poses_given_shared(linear: Linear, variance: float) -> PosesGivenShared:
-    """Return what a stretch without blocks of images says of its poses; variance: px^2."""
+    """Return what a stretch says of its poses, its blocks of images free; variance: px^2."""
     whole, _ = linear.without_points
-    poses, count = linear.extras['pose'], POSE * len(linear.images)
-    inner, shared = whole[np.ix_(poses, poses)], whole[poses, linear.own * len(linear.images):-1]
-    right = np.concatenate([variance * np.eye(count), shared], axis=1)
-    solved = _pose_solution(inner, right, linear.stretch)
+    gone = [name for name in linear.extras if name != 'motion']
+    first = np.concatenate([linear.extras[name] for name in gone])
+    inner = whole[np.ix_(first, first)] + variance * _priors(linear, gone)[0]
+    count, shared = POSE * len(linear.images), whole[first, linear.own * len(linear.images):-1]
+    right = np.concatenate([variance * np.eye(len(first), count), shared], axis=1)
+    solved = _pose_solution(inner, right, linear.stretch)[:count]
     covariance = solved[:, :count]
     return PosesGivenShared((covariance + covariance.T) / 2, -solved[:, count:])
+
+
+def _priors(linear: Linear, names: Sequence[str]) -> tuple[Floats, Floats]:
+    """Return the information (e, e) of the priors of blocks of images, and its score (e,).
+
+    names: of the blocks, in their order; of poses nothing is known before.
+    """
+    size = sum(len(linear.extras[name]) for name in names)
+    information, score, at = np.zeros((size, size)), np.zeros(size), 0
+    for name in names:
+        place = slice(at, at := at + len(linear.extras[name]))
+        if name != 'pose':
+            block = linear.imaging.blocks[name]
+            assert isinstance(block, ImageBlock)
+            precision, off = block.prior_of(linear.stretch)
+            information[place, place], score[place] = precision, precision @ off
+    return information, score
 
 
 def damping(diagonals: Floats, radius: float) -> Floats:

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of two cameras of one car, ahead and back, with exact truth: from drives to a rig."""
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from shared_drive import LENS, QUICK, SPEC
+
+from dashcalib_ros import rig_session
+from dashcalib_ros.camera.mapping import apart
+from dashcalib_ros.camera.rotation import rotation_vectors
+from dashcalib_ros.demo import Drive, Mounting, render_to_bag, true_places
+from dashcalib_ros.input.motion import Samples, SensorStream
+
+BACK = replace(SPEC, rolling_shutter_ms=12.0, mounting=Mounting(
+    178.0, -3.0, 1.0, -0.9, -0.1, 1.2, phase_s=0.05, late_s=0.3))
+
+
+@pytest.fixture(scope='module')
+def placed(shared_drive, tmp_path_factory):
+    """The rig, and what it was made of: drives, and what went into each camera's steps."""
+    folder, kept = tmp_path_factory.mktemp('rig'), {'_refined': {}, 'camera_paths': {}}
+    drives = {'front': shared_drive, 'rear': Drive(LENS, BACK)}
+    for name, drive in drives.items():
+        render_to_bag(drive, folder / name)
+    ride = shared_drive.ride
+    times = np.arange(0.0, ride.duration - 0.2, 0.05)
+    speed = np.gradient(np.interp(times + 0.1, ride.t, ride.s), times)
+
+    def kept_by(step, place):
+        before = getattr(rig_session, step)
+
+        def keeping(*given):
+            kept[step][given[place]] = given
+            return before(*given)
+        return keeping
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rig_session, '_refined', kept_by('_refined', 2))
+        patch.setattr(rig_session, 'camera_paths', kept_by('camera_paths', 0))
+        found = rig_session.calibrate_rig(
+            {name: folder / name for name in drives}, config=QUICK,
+            motion=SensorStream(speed=Samples(times, speed[:, None])))
+    return found, drives, kept
+
+
+def test_pictures_show_where_a_camera_sits(placed):
+    found, drives, _ = placed
+    true, rear = true_places(drives, 'front')['rear'], found.rig.cameras['rear']
+    off = np.degrees(rotation_vectors((rear.rotation @ true.rotation.T)[None])[0])
+    assert np.all(np.abs(off) < 3.5 * np.array(rear.rotation_sigma_deg))
+    assert max(rear.rotation_sigma_deg) < 0.3 and rear.visible.rotation == ('accepted',) * 3
+    assert abs(rear.time_offset_s - true.time_offset_s) < 3.5 * rear.time_sigma_s < 0.01
+    away = np.array(rear.translation_m) - true.translation_m
+    assert np.all(np.abs(away) < 3.5 * np.array(rear.translation_sigma_m))
+    assert found.rig.accepted and not found.rig.witness
+
+
+def test_a_lens_and_its_verdict_stay_together(placed):
+    found, _, kept = placed
+    for name, (each, best, _) in kept['_refined'].items():
+        own, written = each.calibration, found.calibrations[name]
+        assert type(written.camera) is type(own.camera)
+        # the rig's lens is taken within the sigma that was judged, and none beyond it
+        assert apart(written.camera, own.camera).rms < own.sigma_px.rms
+        assert (written.verdict, written.sigma, written.sigma_px) == (
+            own.verdict, own.sigma, own.sigma_px)
+        where = best.problem.lenses[name]
+        longer = replace(best.problem, lenses={
+            **best.problem.lenses, name: where + np.r_[0.05 * own.camera.fx, 0 * where[1:]]})
+        refined, doubts = rig_session._refined(each, replace(best, problem=longer), name)
+        assert [doubt.code for doubt in doubts] == ['E-RIG-LENS-APART']
+        assert refined.calibration.camera == own.camera
+
+
+def test_every_image_is_posed_as_its_shutter_saw_it(placed):
+    _, drives, kept = placed
+    drive = drives['rear']
+    stamps = [drive.stamp_ns(index) for index in range(len(drive))]
+    stretches = kept['camera_paths']['rear'][2]
+    assert len(stretches) == 2
+    for each in stretches:
+        structure, rows = each.scene.structure, each.scene.observed.keyframes
+        true = np.array([drive.row_poses(stamps.index(stamp))[0][LENS.size[1] // 2].T
+                         for stamp in each.scene.tracks.stamps_ns[rows]])
+        found, truth = (every[1:] @ every[:-1].transpose(0, 2, 1)
+                        for every in (structure.rotations[rows], true))
+        off = np.degrees(rotation_vectors(found @ truth.transpose(0, 2, 1)))
+        # bumps pitch the car while rows are exposed, at rates that no two poses tell
+        assert len(rows) > 25 and np.sqrt(np.mean(off**2, axis=0)).max() < 0.007
