@@ -56,6 +56,7 @@ def test_pictures_show_where_a_camera_sits(placed):
     away = np.array(rear.translation_m) - true.translation_m
     assert np.all(np.abs(away) < 3.5 * np.array(rear.translation_sigma_m))
     assert found.rig.accepted and not found.rig.witness
+    assert [each.mount.rear for each in found.calibrations.values()] == [False, True]
 
 
 def test_a_lens_and_its_verdict_stay_together(placed):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
 from pathlib import Path
 
 from dashcalib_ros.cli.arguments import ACCEPTED, NOT_ENOUGH, UsageError
@@ -12,8 +11,8 @@ from dashcalib_ros.cli.run import now
 from dashcalib_ros.cli.terminal import Screen, Stages, warn
 from dashcalib_ros.formats.rig import RIG, rig_json
 from dashcalib_ros.report import output_folder, write_results, write_text
+from dashcalib_ros.report.rig import rig_lines
 from dashcalib_ros.report.tables import line
-from dashcalib_ros.rig.placed import PlacedCamera
 from dashcalib_ros.rig_session import Rig, open_camera, rig_of_drives
 from dashcalib_ros.standard_streams import write_stdout
 
@@ -60,25 +59,3 @@ def write_rig(found: Rig, out: Path) -> None:
     for name, calibration in found.calibrations.items():
         write_results(calibration, out / name, created=now())
     write_text(out / RIG, rig_json(found.rig))
-
-
-def rig_lines(cameras: Mapping[str, PlacedCamera]) -> list[str]:
-    """Return a line for each camera: its verdict, its place, and the sigmas."""
-    found = []
-    for name, camera in cameras.items():
-        text = f'{name}: {camera.verdict}'
-        if camera.rotation_deg is not None and camera.rotation_sigma_deg is not None:
-            text += f', rotation {_values(camera.rotation_deg, camera.rotation_sigma_deg, 2)}°'
-        if camera.translation_m is not None and camera.translation_sigma_m is not None:
-            text += (f', translation '
-                     f'{_values(camera.translation_m, camera.translation_sigma_m, 3)} m')
-        if camera.time_offset_s is not None and camera.time_sigma_s is not None:
-            text += (f', clock {1e3 * camera.time_offset_s:.1f} ± '
-                     f'{1e3 * camera.time_sigma_s:.1f} ms')
-        found.append(text)
-    return found
-
-
-def _values(values: tuple[float, ...], sigmas: tuple[float, ...], digits: int) -> str:
-    return '(' + ', '.join(f'{value:.{digits}f} ± {sigma:.{digits}f}' for value, sigma in zip(
-        values, sigmas, strict=True)) + ')'

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from pathlib import Path
 from typing import Any
 
 from dashcalib_ros.arrays import plain_values
@@ -34,13 +35,26 @@ def rig_json(rig: RigCalibration) -> str:
     return json.dumps(rig_dict(rig), indent=2, allow_nan=False, ensure_ascii=False) + '\n'
 
 
+def _place(path: str | os.PathLike[str]) -> Path:
+    place = path_of(path)
+    return place / RIG if place.is_dir() else place
+
+
+def is_rig(path: str | os.PathLike[str]) -> bool:
+    """Return whether path is a rig.json, by its content, or a folder with one."""
+    try:
+        data = parse_json(read_text(_place(path), JSON_BYTES), str(path))
+    except (InputError, OSError):
+        return False
+    return isinstance(data, dict) and {'base', 'cameras', 'witness'} <= data.keys()
+
+
 def load_rig(path: str | os.PathLike[str]) -> RigCalibration:
     """Read where the cameras of a car sit from path: a rig.json, or its folder.
 
     Raises InputError for what is no rig.json.
     """
-    place = path_of(path)
-    place = place / RIG if place.is_dir() else place
+    place = _place(path)
     data = parse_json(read_text(place, JSON_BYTES), str(place))
     try:
         cameras = {str(name): _camera(values) for name, values in data['cameras'].items()}

@@ -164,13 +164,14 @@ def placed(name: str, calibration: str, solved: Solved, metric: bool, clock: flo
                       'refused' if 'not visible' in visible.rotation else 'weak')
     return PlacedCamera(
         calibration, verdict,
-        _three(np.degrees(rotation_vectors(place.rotation[None])[0])), _three(sigma[:3]),
-        _three(place.translation_m) if metric else None,
-        _three(sigma[3:6]) if metric else None, place.late_s + clock, float(sigma[6]), visible,
+        three(np.degrees(rotation_vectors(place.rotation[None])[0])), three(sigma[:3]),
+        three(place.translation_m) if metric else None,
+        three(sigma[3:6]) if metric else None, place.late_s + clock, float(sigma[6]), visible,
         (*doubts, *_reasons(name, visible, len(groups), apart, sigma, metric)))
 
 
-def _three(values: Floats) -> Three:
+def three(values: Floats) -> Three:
+    """Return the three values of an array."""
     x, y, z = values.tolist()
     return x, y, z
 
