@@ -9,7 +9,8 @@ from dashcalib_ros.cli.arguments import ACCEPTED, NOT_ENOUGH, UsageError
 from dashcalib_ros.cli.drive import read_config
 from dashcalib_ros.cli.run import now
 from dashcalib_ros.cli.terminal import Screen, Stages, warn
-from dashcalib_ros.formats.rig import RIG, rig_json
+from dashcalib_ros.errors import ConfigError, Notice
+from dashcalib_ros.formats.rig import RIG, RIG_FORMATS, placed_cameras, rig_json
 from dashcalib_ros.report import output_folder, write_results, write_text
 from dashcalib_ros.report.rig import rig_lines
 from dashcalib_ros.report.tables import line
@@ -36,7 +37,8 @@ def rig(args: argparse.Namespace) -> int:
                 *(line(f'{a} and {b} see the same: {each.matches} matches, epipolar residual '
                        f'{each.median:.2f} px, over the picture {each.cells_rms:.2f} px RMS')
                   for (a, b), each in found.rig.witness.items()),
-                line(f'written to {args.out}: {RIG}, and a folder for each camera'))
+                line(f'written to {args.out}: {RIG}, {", ".join(RIG_FORMATS)}, and a folder for '
+                     f'each camera'))
     return ACCEPTED if found.rig.accepted else NOT_ENOUGH
 
 
@@ -55,7 +57,14 @@ def named(cameras: list[str]) -> dict[str, str]:
 
 
 def write_rig(found: Rig, out: Path) -> None:
-    """Write rig.json, and the results of each camera in a folder of its name."""
+    """Write rig.json, the same for other programs, and each camera's results in its folder."""
     for name, calibration in found.calibrations.items():
         write_results(calibration, out / name, created=now())
+    cameras = placed_cameras(found.rig, found.calibrations)
+    for name, write in RIG_FORMATS.items():
+        try:
+            write_text(out / name, write(cameras))
+        except ConfigError as error:
+            (out / name).unlink(missing_ok=True)
+            warn([Notice(error.code, f'{name} is not written: {error}')])
     write_text(out / RIG, rig_json(found.rig))
