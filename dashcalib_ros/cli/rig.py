@@ -12,7 +12,8 @@ from dashcalib_ros.cli.terminal import Screen, Stages, warn
 from dashcalib_ros.errors import ConfigError, Notice
 from dashcalib_ros.formats.rig import RIG, RIG_FORMATS, placed_cameras, rig_json
 from dashcalib_ros.report import output_folder, write_results, write_text
-from dashcalib_ros.report.rig import rig_lines
+from dashcalib_ros.report.files import REPORT
+from dashcalib_ros.report.rig import rig_html, rig_lines, witness_lines
 from dashcalib_ros.report.tables import line
 from dashcalib_ros.rig_session import Rig, open_camera, rig_of_drives
 from dashcalib_ros.standard_streams import write_stdout
@@ -34,11 +35,9 @@ def rig(args: argparse.Namespace) -> int:
     if args.json:
         write_stdout(rig_json(found.rig).rstrip('\n'))
     screen.show(*(line(text) for text in rig_lines(found.rig.cameras)),
-                *(line(f'{a} and {b} see the same: {each.matches} matches, epipolar residual '
-                       f'{each.median:.2f} px, over the picture {each.cells_rms:.2f} px RMS')
-                  for (a, b), each in found.rig.witness.items()),
-                line(f'written to {args.out}: {RIG}, {", ".join(RIG_FORMATS)}, and a folder for '
-                     f'each camera'))
+                *map(line, witness_lines(found.rig)),
+                line(f'written to {args.out}: {RIG}, {REPORT}, {", ".join(RIG_FORMATS)} and a '
+                     f'folder for each camera'))
     return ACCEPTED if found.rig.accepted else NOT_ENOUGH
 
 
@@ -67,4 +66,5 @@ def write_rig(found: Rig, out: Path) -> None:
         except ConfigError as error:
             (out / name).unlink(missing_ok=True)
             warn([Notice(error.code, f'{name} is not written: {error}')])
+    write_text(out / REPORT, rig_html(found.rig, cameras))
     write_text(out / RIG, rig_json(found.rig))
