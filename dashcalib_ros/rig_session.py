@@ -35,6 +35,7 @@ from dashcalib_ros.rig.placed import (
     base_camera,
     base_doubts,
     lens_doubts,
+    misnamed,
     not_placed,
     placed,
     why_not_aligned,
@@ -158,7 +159,9 @@ def rig_of_drives(drives: Mapping[str, Recording], base: str | None = None,
                 name, place(name), best, metres is not None,
                 learned[name].start_s - learned[base].start_s, config.rig,
                 (*doubts[name], *base_doubts(name, base, doubts[base])))
-    return Rig(RigCalibration(base, cameras, witness),
+    mount = learned[base].calibration.mount
+    warnings = () if mount is None else misnamed(cameras, mount.rotation)
+    return Rig(RigCalibration(base, cameras, witness, warnings),
                {name: each.calibration for name, each in learned.items()})
 
 

@@ -11,8 +11,12 @@ from shared_drive import LENS, QUICK, SPEC
 from dashcalib_ros import rig_session
 from dashcalib_ros.camera.mapping import apart
 from dashcalib_ros.camera.rotation import rotation_vectors
+from dashcalib_ros.cli.rig import write_rig
 from dashcalib_ros.demo import Drive, Mounting, render_to_bag, true_places
+from dashcalib_ros.formats import load_camera
+from dashcalib_ros.formats.rig import RIG_FORMATS, load_rig
 from dashcalib_ros.input.motion import Samples, SensorStream
+from dashcalib_ros.judge import Verdict
 
 BACK = replace(SPEC, rolling_shutter_ms=12.0, mounting=Mounting(
     178.0, -3.0, 1.0, -0.9, -0.1, 1.2, phase_s=0.05, late_s=0.3))
@@ -91,3 +95,21 @@ def test_every_image_is_posed_as_its_shutter_saw_it(placed):
         off = np.degrees(rotation_vectors(found @ truth.transpose(0, 2, 1)))
         # bumps pitch the car while rows are exposed, at rates that no two poses tell
         assert len(rows) > 25 and np.sqrt(np.mean(off**2, axis=0)).max() < 0.007
+
+
+def test_a_rig_is_written_for_all_who_take_it(placed, tmp_path):
+    found, _, _ = placed
+    write_rig(found, tmp_path)
+    assert {each.name for each in tmp_path.iterdir()} == {
+        'rig.json', 'report.html', 'front', 'rear', *RIG_FORMATS}
+    read = load_rig(tmp_path)
+    assert read == found.rig and read.accepted
+    for name, camera in read.cameras.items():
+        given = load_camera(tmp_path / camera.calibration)
+        assert given.camera == found.calibrations[name].camera and given.verdict == 'accepted'
+    # written again, without what it cannot have any more
+    refused = {name: replace(each, camera=None, sigma=None, covariance=None, sigma_px=None,
+                             verdict=Verdict('refused', ('no turns',)))
+               for name, each in found.calibrations.items()}
+    write_rig(replace(found, calibrations=refused), tmp_path)
+    assert not (tmp_path / 'camchain.yaml').exists() and (tmp_path / 'rig.urdf').exists()

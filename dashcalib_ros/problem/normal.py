@@ -8,7 +8,7 @@ shared.
 """
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -242,10 +242,10 @@ def normal_equations(linear: Linear, variance: float = 1.0, kept: Sequence[str] 
     first = np.concatenate([extras[name] for name in gone])
     rest = np.concatenate([*(extras[name] for name in kept if name in extras),
                            np.arange(own * len(linear.images), len(whole))])
-    precision, off = _priors(linear, gone)
-    inner = whole[np.ix_(first, first)] + variance * precision
-    right = whole[np.ix_(first, rest)]
-    right[:, -1] -= variance * off
+    inner, right = whole[np.ix_(first, first)], whole[np.ix_(first, rest)]
+    for place, precision, off in _priors(linear, gone):
+        inner[place, place] += variance * precision
+        right[place, -1] -= variance * (precision @ off)
     solved = _pose_solution(inner, right, linear.stretch)
     left = whole[np.ix_(rest[:-1], rest)] - right[:, :-1].T @ solved
     size, places = len(left), {}
@@ -277,7 +277,9 @@ def poses_given_shared(linear: Linear, variance: float) -> PosesGivenShared:
     whole, _ = linear.without_points
     gone = [name for name in linear.extras if name != 'motion']
     first = np.concatenate([linear.extras[name] for name in gone])
-    inner = whole[np.ix_(first, first)] + variance * _priors(linear, gone)[0]
+    inner = whole[np.ix_(first, first)]
+    for place, precision, _ in _priors(linear, gone):
+        inner[place, place] += variance * precision
     count, shared = POSE * len(linear.images), whole[first, linear.own * len(linear.images):-1]
     right = np.concatenate([variance * np.eye(len(first), count), shared], axis=1)
     solved = _pose_solution(inner, right, linear.stretch)[:count]
@@ -285,21 +287,18 @@ def poses_given_shared(linear: Linear, variance: float) -> PosesGivenShared:
     return PosesGivenShared((covariance + covariance.T) / 2, -solved[:, count:])
 
 
-def _priors(linear: Linear, names: Sequence[str]) -> tuple[Floats, Floats]:
-    """Return the information (e, e) of the priors of blocks of images, and its score (e,).
+def _priors(linear: Linear, names: Sequence[str]) -> Iterator[tuple[slice, Floats, Floats]]:
+    """Yield the place, the information of the prior, and how far it is off, of blocks of images.
 
     names: of the blocks, in their order; of poses nothing is known before.
     """
-    size = sum(len(linear.extras[name]) for name in names)
-    information, score, at = np.zeros((size, size)), np.zeros(size), 0
+    at = 0
     for name in names:
         place = slice(at, at := at + len(linear.extras[name]))
         if name != 'pose':
             block = linear.imaging.blocks[name]
             assert isinstance(block, ImageBlock)
-            precision, off = block.prior_of(linear.stretch)
-            information[place, place], score[place] = precision, precision @ off
-    return information, score
+            yield place, *block.prior_of(linear.stretch)
 
 
 def damping(diagonals: Floats, radius: float) -> Floats:

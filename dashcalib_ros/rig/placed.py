@@ -2,6 +2,8 @@
 """The result: where each camera sits, with a verdict for each degree of freedom."""
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
@@ -34,6 +36,10 @@ LEAST_STRETCHES = 2
 # times its sigmas: stretches that differ by more contradict each other
 DISAGREE = 3.0
 AXES = ('x', 'y', 'z')
+# degrees to the left, by words of a camera's name; and how far off it may look: the left one of a
+# stereo pair looks ahead
+SIDES = {'front': 0.0, 'left': 90.0, 'right': -90.0, 'rear': 180.0, 'back': 180.0}
+ELSEWHERE_DEG = 110.0
 
 
 @dataclass(frozen=True)
@@ -168,6 +174,24 @@ def placed(name: str, calibration: str, solved: Solved, metric: bool, clock: flo
         three(place.translation_m) if metric else None,
         three(sigma[3:6]) if metric else None, place.late_s + clock, float(sigma[6]), visible,
         (*doubts, *_reasons(name, visible, len(groups), apart, sigma, metric)))
+
+
+def misnamed(cameras: Mapping[str, PlacedCamera], car: Floats) -> tuple[Notice, ...]:
+    """Return which cameras look elsewhere than their names say.
+
+    car: (3, 3) from the base's optical axes to the car's: x ahead, y to the left.
+    """
+    found = []
+    for name, camera in cameras.items():
+        sides = [SIDES[word] for word in re.split('[-_]', name.lower()) if word in SIDES]
+        if len(sides) == 1 and camera.rotation is not None:
+            ahead, left, _ = (car @ camera.rotation[2]).tolist()
+            yaw = math.degrees(math.atan2(left, ahead))
+            if abs(math.remainder(yaw - sides[0], 360)) > ELSEWHERE_DEG:
+                found.append(Notice('E-RIG-SIDE', f'{name} looks {abs(yaw):.0f} degrees to the '
+                                    f'{"left" if yaw > 0 else "right"} of ahead: check that no '
+                                    f'two inputs were exchanged'))
+    return tuple(found)
 
 
 def three(values: Floats) -> Three:

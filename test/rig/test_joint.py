@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 from made_rig import SPEED, Mounted, made_paths
 
-from dashcalib_ros.camera.rotation import rotation_matrices, rotation_vectors
+from dashcalib_ros.camera.rotation import OPTICAL, rotation_matrices, rotation_vectors
 from dashcalib_ros.config import RigConfig
 from dashcalib_ros.rig.joint import Solved, solved
 from dashcalib_ros.rig.paths import CameraPaths
 from dashcalib_ros.rig.placed import (
+    PlacedCamera,
     base_camera,
     base_doubts,
     lens_doubts,
+    misnamed,
     placed,
     why_not_aligned,
 )
@@ -99,6 +101,24 @@ def test_one_stretch_or_a_refused_lens_is_weak():
         found = placed('rear', '', best, True, 0.0, RigConfig(), doubts)
         assert found.verdict == 'weak' and found.rotation_deg is not None
         assert [reason.code for reason in found.reasons] == [code]
+
+
+def test_cameras_that_look_elsewhere_than_they_are_called_are_named():
+    def looking(**yaws_left):
+        return {name: PlacedCamera('', 'accepted', (0.0, float(yaw), 0.0), (0.1, 0.1, 0.1))
+                for name, yaw in yaws_left.items()}
+
+    def named(ahead_deg=0.0, **yaws_left):
+        car = rotation_matrices(np.radians([[0.0, 0.0, ahead_deg]]))[0] @ OPTICAL
+        found = misnamed(looking(**yaws_left), car)
+        assert all(each.code == 'E-RIG-SIDE' for each in found)
+        return [str(each).split()[0] for each in found]
+
+    assert not named(front=0, left=70, rear=178, side=100)
+    # of a stereo pair, and where the base looks back
+    assert not named(left=0, right=0.5) and not named(180.0, rear=0, front=180)
+    assert named(front=0, left=-80, right=75) == ['left', 'right']
+    assert named(180.0, front=0, rear=179) == ['front', 'rear']
 
 
 @pytest.mark.parametrize('level', ['weak', 'refused'])
