@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Mask
-from dashcalib_ros.camera.mapping import apart, as_model
 from dashcalib_ros.camera.rotation import rotation_vectors
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import InputError, Notice
@@ -32,6 +31,7 @@ from dashcalib_ros.rig.paths import CameraPaths, camera_paths, coarse_paths, ord
 from dashcalib_ros.rig.placed import (
     PlacedCamera,
     RigCalibration,
+    apart_doubts,
     base_camera,
     base_doubts,
     lens_doubts,
@@ -144,8 +144,7 @@ def rig_of_drives(drives: Mapping[str, Recording], base: str | None = None,
     witness: Mapping[tuple[str, str], Epipolar] = {}
     if best is not None:
         for name in best.problem.lenses:
-            learned[name], moved = _refined(learned[name], best, name)
-            doubts[name] += moved
+            doubts[name] += apart_doubts(name, best)
         witness, contradicted = _witnessed(learned, best, matches)
         doubts = {name: (*each, *contradicted.get(name, ())) for name, each in doubts.items()}
     for name in drives:
@@ -331,29 +330,6 @@ def _contradicted(free: Fitted, across: Floats, best: Solved, a: str, b: str) ->
     return float(np.linalg.norm(away)) if beyond.any() else 0.0
 
 
-def _refined(each: Learned, best: Solved, name: str) -> tuple[Learned, tuple[Notice, ...]]:
-    """Return what a drive gave with the lens that the rig's rotations go with, and no doubts.
-
-    Verdict and sigma are of the camera's own lens, and nothing else judges the rig's: where that
-    is farther off than by this sigma, the own one stays, and a doubt says so.
-    """
-    calibration, own, px = each.calibration, each.solution, each.scale.px
-    if calibration.camera is None or calibration.sigma_px is None or own is None:
-        return each, ()
-    wide = own.camera.widened()
-    camera = as_model(wide.with_params(wide.params + best.problem.lenses[name][:-1]),
-                      type(own.camera)).resized(px, calibration.image_size)
-    away = apart(camera, calibration.camera)
-    if away is None or away.rms > calibration.sigma_px.rms:
-        return each, (Notice(
-            'E-RIG-LENS-APART', f'{name}: the rig asks for another lens than the one that its own '
-            f'turns show{"" if away is None else f", by {away.rms:.1f} px over the picture"}: '
-            f'check that the camera was not moved during the drive, or drive more turns'),)
-    written = replace(own.written, camera=camera.resized(1 / px, own.camera.image_size))
-    return replace(each, calibration=replace(calibration, camera=camera),
-                   solution=replace(own, written=written)), ()
-
-
 def _metres(each: Learned) -> Metres | None:
     """Return the speed of the car, where the drive has one."""
     if each.drive.motion is None:
@@ -383,7 +359,7 @@ def calibrate_rig(drives: Mapping[str, Paths | Recording], base: str | None = No
     progress: called with the name of a stage and its fraction done, 0 to 1; at last 'done', 1.0.
 
     Returns a Rig: its rig has a PlacedCamera for each name, with a verdict for each degree of
-    freedom; its calibrations have each camera's lens as the whole rig shows it. Raises InputError
+    freedom; its calibrations are those of each camera alone. Raises InputError
     for input that cannot be read, ConfigError for a bad setting, WorkerError if a child process
     cannot run.
     """

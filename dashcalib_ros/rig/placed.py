@@ -15,6 +15,7 @@ from dashcalib_ros.camera.rotation import rotation_matrices, rotation_vectors
 from dashcalib_ros.config import RigConfig
 from dashcalib_ros.errors import Notice
 from dashcalib_ros.judge.calibration import Level
+from dashcalib_ros.judge.difference import limit_of
 from dashcalib_ros.rig.joint import REACH_M, Solved
 from dashcalib_ros.rig.start import LEAST_EXPLAINED, Aligned
 from dashcalib_ros.rig.witness import Epipolar
@@ -101,6 +102,14 @@ def lens_doubts(name: str, level: Level) -> tuple[Notice, ...]:
     return () if level == 'accepted' else (Notice(
         'E-RIG-LENS', f'{name}: its lens is {level}, so its rotation is weak at best: drive turns '
         f'in which it sees more'),)
+
+
+def apart_doubts(name: str, solved: Solved) -> tuple[Notice, ...]:
+    """Return that a rig's paths ask for another lens than a camera's own turns allow, or none."""
+    return () if solved.lens_distance[name] <= limit_of(
+        len(solved.problem.lenses[name])) else (Notice(
+            'E-RIG-LENS-APART', f'{name}: the other cameras ask for another lens than its own '
+            f'turns show: check that it was not moved during the drive, or drive more turns'),)
 
 
 def base_doubts(name: str, base: str, doubts: Sequence[Notice]) -> tuple[Notice, ...]:

@@ -14,6 +14,7 @@ from dashcalib_ros.rig.joint import Solved, solved
 from dashcalib_ros.rig.paths import CameraPaths
 from dashcalib_ros.rig.placed import (
     PlacedCamera,
+    apart_doubts,
     base_camera,
     base_doubts,
     lens_doubts,
@@ -126,6 +127,23 @@ def test_a_base_is_no_surer_than_its_lens(level):
     found = base_camera('front/result.json', lens_doubts('front', level))
     assert found.verdict == 'weak' and [each.code for each in found.reasons] == ['E-RIG-LENS']
     assert base_camera('front/result.json').verdict == 'accepted'
+
+
+def test_lenses_stay_as_their_own_turns_say():
+    paths, lenses = made_paths({name: CAMERAS[name] for name in ('front', 'rear')},
+                               yaws=(85.0, -75.0))
+    found = {'rear': aligned(paths['rear'], paths['front'])}
+    best = solved(problem_of(paths, 'front', found, speed))
+    assert all(np.abs(value).max() < 1e-9 for value in best.problem.lenses.values())
+    assert not apart_doubts('rear', best) and not apart_doubts('front', best)
+    # a lens that its own turns call much better than it is
+    own = paths['rear'].lens_covariance
+    paths['rear'] = replace(paths['rear'], lens_covariance=own / 40**2)
+    paths['front'] = replace(paths['front'], lens_covariance=own / 40**2)
+    assert abs(lenses['rear'][2] - lenses['front'][2]) > 0.5
+    best = solved(problem_of(paths, 'front', found, speed))
+    assert 'E-RIG-LENS-APART' in [each.code for name in ('front', 'rear')
+                                  for each in apart_doubts(name, best)]
 
 
 def test_a_camera_that_was_moved_between_two_turns_is_not_accepted():
