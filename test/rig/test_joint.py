@@ -138,8 +138,8 @@ def test_lenses_stay_as_their_own_turns_say():
     assert not apart_doubts('rear', best) and not apart_doubts('front', best)
     # a lens that its own turns call much better than it is
     own = paths['rear'].lens_covariance
-    paths['rear'] = replace(paths['rear'], lens_covariance=own / 40**2)
-    paths['front'] = replace(paths['front'], lens_covariance=own / 40**2)
+    paths['rear'] = replace(paths['rear'], lens_covariance=own / 10**2)
+    paths['front'] = replace(paths['front'], lens_covariance=own / 10**2)
     assert abs(lenses['rear'][2] - lenses['front'][2]) > 0.5
     best = solved(problem_of(paths, 'front', found, speed))
     assert 'E-RIG-LENS-APART' in [each.code for name in ('front', 'rear')
