@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Mask
-from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.rotation import rotation_vectors
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import InputError, Notice
@@ -25,15 +24,18 @@ from dashcalib_ros.input.inputs import Paths
 from dashcalib_ros.input.motion import speeds_of
 from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.pipeline import Calibrator
-from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.report import Calibration
-from dashcalib_ros.rig.dense import retraced
+from dashcalib_ros.rig.dense import Retraced, retraced
 from dashcalib_ros.rig.joint import Solved, solved
 from dashcalib_ros.rig.paths import CameraPaths, camera_paths, coarse_paths, ordered
 from dashcalib_ros.rig.placed import (
     PlacedCamera,
     RigCalibration,
+    apart_doubts,
     base_camera,
+    base_doubts,
+    lens_doubts,
+    misnamed,
     not_placed,
     placed,
     why_not_aligned,
@@ -136,24 +138,30 @@ def rig_of_drives(drives: Mapping[str, Recording], base: str | None = None,
     metres = _metres(learned[base])
     problem = problem_of(paths, base, kept, metres)
     best = solved(problem) if problem.pairs else None
-    calibrations = {name: each.calibration if best is None else _refined(each, best, name)
-                    for name, each in learned.items()}
-    levels = {name: each.calibration.verdict.level for name, each in learned.items()}
+    doubts = {name: lens_doubts(name, each.calibration.verdict.level)
+              for name, each in learned.items()}
     cameras: dict[str, PlacedCamera] = {}
     witness: Mapping[tuple[str, str], Epipolar] = {}
     if best is not None:
-        witness, doubts = _witnessed(learned, best, matches)
+        for name in best.problem.lenses:
+            doubts[name] += apart_doubts(name, best)
+        witness, contradicted = _witnessed(learned, best, matches)
+        doubts = {name: (*each, *contradicted.get(name, ())) for name, each in doubts.items()}
     for name in drives:
         if name == base:
-            cameras[name] = base_camera(place(name), levels[name])
+            cameras[name] = base_camera(place(name), doubts[name])
         elif best is None or name not in best.problem.places:
             cameras[name] = not_placed(place(name), why_not_aligned(
                 name, base, turned[name], len(found[name].scenes)))
         else:
             cameras[name] = placed(
-                name, place(name), levels[name], best, metres is not None,
-                learned[name].start_s - learned[base].start_s, config.rig, doubts.get(name, ()))
-    return Rig(RigCalibration(base, cameras, witness), calibrations)
+                name, place(name), best, metres is not None,
+                learned[name].start_s - learned[base].start_s, config.rig,
+                (*doubts[name], *base_doubts(name, base, doubts[base])))
+    mount = learned[base].calibration.mount
+    warnings = () if mount is None else misnamed(cameras, mount.rotation)
+    return Rig(RigCalibration(base, cameras, witness, warnings),
+               {name: each.calibration for name, each in learned.items()})
 
 
 def _learn(name: str, drive: Recording, config: Config, observer: Observer) -> Learned:
@@ -248,14 +256,14 @@ class _Again:
             scene = ordered(each.solution)[n]
             calls[name, n] = pool.begin(
                 retraced, list(frames.values()), scene, each.solution, self._config, each.valid)
-        scenes: dict[str, list[Scene]] = {name: [] for name in self._late}
+        stretches: dict[str, list[Retraced]] = {name: [] for name in self._late}
         for number, ((name, _), call) in enumerate(calls.items()):
             observer.show('retracing the stretches that cameras share', number / len(calls))
-            scene = pool.result(call)
-            if scene is not None:
-                scenes[name].append(scene)
+            stretch = pool.result(call)
+            if stretch is not None:
+                stretches[name].append(stretch)
         found = {}
-        for name, theirs in scenes.items():
+        for name, theirs in stretches.items():
             each = self._learned[name]
             if each.solution is not None:
                 found[name] = camera_paths(name, each.solution, theirs, each.start_s)
@@ -291,9 +299,9 @@ def _witnessed(learned: Mapping[str, Learned], best: Solved,
     for (a, b), pairs in matches.items():
         if not pairs or not {a, b} <= best.problem.places.keys():
             continue
-        cameras = [_lens(learned[name], best, name) for name in (a, b)]
-        rays, xy = rays_of(cameras, pairs, [learned[name].solution.field  # type: ignore[union-attr]
-                                            for name in (a, b)])
+        solutions = [solution for name in (a, b) if (solution := learned[name].solution)]
+        cameras = [solution.camera for solution in solutions]
+        rays, xy = rays_of(cameras, pairs, [solution.field for solution in solutions])
         across = best.problem.places[b].rotation @ best.problem.places[a].rotation.T
         scale = learned[a].scale.px
         held = fitted(rays, across, cameras[0].fx)
@@ -320,26 +328,6 @@ def _contradicted(free: Fitted, across: Floats, best: Solved, a: str, b: str) ->
     sigma = np.hypot(sigma, np.degrees(np.sqrt(np.diag(free.covariance))))
     beyond = np.abs(away) > np.maximum(CONTRADICTED * sigma, LEAST_APART_DEG)
     return float(np.linalg.norm(away)) if beyond.any() else 0.0
-
-
-def _lens(each: Learned, best: Solved, name: str) -> Camera:
-    """Return a camera's lens as the rig has it, of the resized pictures."""
-    assert each.solution is not None
-    wide = each.solution.camera.widened()
-    return wide.with_params(wide.params + best.problem.lenses[name][:-1])
-
-
-def _refined(each: Learned, best: Solved, name: str) -> Calibration:
-    """Return a camera's calibration with the lens that the rig's rotations go with."""
-    calibration, where = each.calibration, best.problem.where.get(('lens', name))
-    if calibration.camera is None or where is None:
-        return calibration
-    camera = _lens(each, best, name).resized(each.scale.px, calibration.image_size)
-    units = camera.units(each.scale.px)
-    covariance = best.covariance[where, where][:-1, :-1] * np.outer(units, units)
-    return replace(
-        calibration, camera=camera, covariance=covariance, picture_covariance=covariance,
-        sigma=dict(zip(camera.names(), np.sqrt(np.diag(covariance)).tolist(), strict=True)))
 
 
 def _metres(each: Learned) -> Metres | None:
@@ -371,7 +359,7 @@ def calibrate_rig(drives: Mapping[str, Paths | Recording], base: str | None = No
     progress: called with the name of a stage and its fraction done, 0 to 1; at last 'done', 1.0.
 
     Returns a Rig: its rig has a PlacedCamera for each name, with a verdict for each degree of
-    freedom; its calibrations have each camera's lens as the whole rig shows it. Raises InputError
+    freedom; its calibrations are those of each camera alone. Raises InputError
     for input that cannot be read, ConfigError for a bad setting, WorkerError if a child process
     cannot run.
     """

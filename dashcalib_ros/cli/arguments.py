@@ -349,18 +349,16 @@ COMMANDS = {
             ('--keep-bag', {**FLAG, 'help': 'keep the bag in DIR/bag'}), JSON, QUIET, VERBOSE),
         exit_codes=EXIT_HELP),
     'compare': Command(
-        'dashcalib_ros.cli.cameras', 'compare two calibrations',
+        'dashcalib_ros.cli.cameras', 'compare two calibrations, or two rigs',
         'Compares where both calibrations see the same rays, in pixels over the picture, after '
         'the best common rotation; whether the difference is significant, and whether it '
-        'matters.',
+        'matters. Of two rigs it says which camera was moved, or exchanged with another one.',
         'dashcalib compare calibration /etc/camera/old.yaml --html compare.html', (
             ('a', {'metavar': 'A', 'type': Path, 'help': CALIBRATION_HELP}),
             ('b', {'metavar': 'B', 'type': Path,
                    'help': 'the reference: the same kinds of files'}),
             ('--html', {'type': path_or('use the name of a file'), 'metavar': 'FILE',
                         'help': 'write a page with maps of the difference, in px and in sigmas'}),
-            ('--rig', {**FLAG, 'help': 'A and B are two cameras of one car: show how B is '
-                                       'mounted against A, and whether both saw one drive'}),
             JSON)),
     'rig': Command(
         'dashcalib_ros.cli.rig', 'calibrate several cameras of one car, and where each sits',

@@ -16,20 +16,22 @@ from dashcalib_ros.formats import export as exported
 from dashcalib_ros.formats import load_calibration, load_camera
 from dashcalib_ros.formats.export import EXPORTS, check_suffix, cropped, resized
 from dashcalib_ros.formats.load import load_pair
+from dashcalib_ros.formats.rig import is_rig, load_rig
 from dashcalib_ros.input.source import size_text
-from dashcalib_ros.judge.rig import rig_of
 from dashcalib_ros.report import compare as compare_cameras
 from dashcalib_ros.report import write_text
 from dashcalib_ros.report.page import difference_html
+from dashcalib_ros.report.rig import change_lines
 from dashcalib_ros.report.tables import comparison, line
-from dashcalib_ros.report.wording import mount_text, rig_texts, verdict_text
+from dashcalib_ros.report.wording import verdict_text
+from dashcalib_ros.rig.moved import changes
 from dashcalib_ros.standard_streams import write_stdout
 
 
 def compare(args: argparse.Namespace) -> int:
     """Show how far A differs from B, and for which uses A is good enough."""
-    if args.rig:
-        return _rig(args)
+    if is_rig(args.a) or is_rig(args.b):
+        return _rigs(args)
     found = compare_cameras(*load_pair(args.a, args.b))
     warn((*found.a.warnings, *found.b.warnings))
     if args.html is not None:
@@ -43,19 +45,16 @@ def compare(args: argparse.Namespace) -> int:
     return ACCEPTED
 
 
-def _rig(args: argparse.Namespace) -> int:
+def _rigs(args: argparse.Namespace) -> int:
+    """Show which cameras of rig A were moved since rig B."""
     if args.html is not None:
         raise UsageError('E-RIG-HTML', '--html maps the difference of two calibrations of one '
-                                       'camera; omit it with --rig')
-    a, b = load_calibration(args.a), load_calibration(args.b)
-    found = rig_of(a, b)
+                                       'camera; omit it for rigs')
+    found = changes(load_rig(args.a), load_rig(args.b))
     if args.json:
-        print_json(plain_values(found) | {'agrees': found.agrees})
-        return ACCEPTED
-    for side, path, calibration in (('A', args.a, a), ('B', args.b, b)):
-        if calibration.mount is not None:
-            show(line(f'{side}: {path}: {mount_text(calibration.mount)}'))
-    show(Group(*map(line, rig_texts(found))))
+        print_json({'answer': found.answer, **plain_values(found)})
+    else:
+        show(Group(*map(line, change_lines(found))))
     return ACCEPTED
 
 

@@ -20,7 +20,7 @@ from dashcalib_ros.camera import camera_of
 from dashcalib_ros.camera.mapping import Apart, apart_at, grid_of
 from dashcalib_ros.cli.arguments import ACCEPTED, NOT_ENOUGH, exit_code
 from dashcalib_ros.cli.drive import read_config
-from dashcalib_ros.cli.rig import rig_lines, write_rig
+from dashcalib_ros.cli.rig import write_rig
 from dashcalib_ros.cli.run import files_line, now, warn_of
 from dashcalib_ros.cli.terminal import Screen, Stages, print_json
 from dashcalib_ros.config import Config
@@ -45,6 +45,7 @@ from dashcalib_ros.report import (
     write_text,
 )
 from dashcalib_ros.report.files import TRUTH
+from dashcalib_ros.report.rig import rig_lines
 from dashcalib_ros.report.tables import against_truth, conclusion, line, next_step, summary
 from dashcalib_ros.report.wording import optional
 from dashcalib_ros.rig_session import rig_of_drives

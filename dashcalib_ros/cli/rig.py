@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
 from pathlib import Path
 
 from dashcalib_ros.cli.arguments import ACCEPTED, NOT_ENOUGH, UsageError
 from dashcalib_ros.cli.drive import read_config
 from dashcalib_ros.cli.run import now
 from dashcalib_ros.cli.terminal import Screen, Stages, warn
-from dashcalib_ros.formats.rig import RIG, rig_json
+from dashcalib_ros.errors import ConfigError, Notice
+from dashcalib_ros.formats.rig import RIG, RIG_FORMATS, placed_cameras, rig_json
 from dashcalib_ros.report import output_folder, write_results, write_text
+from dashcalib_ros.report.files import REPORT
+from dashcalib_ros.report.rig import rig_html, rig_lines, witness_lines
 from dashcalib_ros.report.tables import line
-from dashcalib_ros.rig.placed import PlacedCamera
 from dashcalib_ros.rig_session import Rig, open_camera, rig_of_drives
 from dashcalib_ros.standard_streams import write_stdout
 
@@ -34,10 +35,9 @@ def rig(args: argparse.Namespace) -> int:
     if args.json:
         write_stdout(rig_json(found.rig).rstrip('\n'))
     screen.show(*(line(text) for text in rig_lines(found.rig.cameras)),
-                *(line(f'{a} and {b} see the same: {each.matches} matches, epipolar residual '
-                       f'{each.median:.2f} px, over the picture {each.cells_rms:.2f} px RMS')
-                  for (a, b), each in found.rig.witness.items()),
-                line(f'written to {args.out}: {RIG}, and a folder for each camera'))
+                *map(line, witness_lines(found.rig)),
+                line(f'written to {args.out}: {RIG}, {REPORT}, {", ".join(RIG_FORMATS)} and a '
+                     f'folder for each camera'))
     return ACCEPTED if found.rig.accepted else NOT_ENOUGH
 
 
@@ -56,29 +56,15 @@ def named(cameras: list[str]) -> dict[str, str]:
 
 
 def write_rig(found: Rig, out: Path) -> None:
-    """Write rig.json, and the results of each camera in a folder of its name."""
+    """Write rig.json, the same for other programs, and each camera's results in its folder."""
     for name, calibration in found.calibrations.items():
         write_results(calibration, out / name, created=now())
+    cameras = placed_cameras(found.rig, found.calibrations)
+    for name, write in RIG_FORMATS.items():
+        try:
+            write_text(out / name, write(cameras))
+        except ConfigError as error:
+            (out / name).unlink(missing_ok=True)
+            warn([Notice(error.code, f'{name} is not written: {error}')])
+    write_text(out / REPORT, rig_html(found.rig, cameras))
     write_text(out / RIG, rig_json(found.rig))
-
-
-def rig_lines(cameras: Mapping[str, PlacedCamera]) -> list[str]:
-    """Return a line for each camera: its verdict, its place, and the sigmas."""
-    found = []
-    for name, camera in cameras.items():
-        text = f'{name}: {camera.verdict}'
-        if camera.rotation_deg is not None and camera.rotation_sigma_deg is not None:
-            text += f', rotation {_values(camera.rotation_deg, camera.rotation_sigma_deg, 2)}°'
-        if camera.translation_m is not None and camera.translation_sigma_m is not None:
-            text += (f', translation '
-                     f'{_values(camera.translation_m, camera.translation_sigma_m, 3)} m')
-        if camera.time_offset_s is not None and camera.time_sigma_s is not None:
-            text += (f', clock {1e3 * camera.time_offset_s:.1f} ± '
-                     f'{1e3 * camera.time_sigma_s:.1f} ms')
-        found.append(text)
-    return found
-
-
-def _values(values: tuple[float, ...], sigmas: tuple[float, ...], digits: int) -> str:
-    return '(' + ', '.join(f'{value:.{digits}f} ± {sigma:.{digits}f}' for value, sigma in zip(
-        values, sigmas, strict=True)) + ')'

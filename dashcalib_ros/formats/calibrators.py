@@ -11,7 +11,7 @@ from __future__ import annotations
 import ast
 import json
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -39,6 +39,7 @@ from dashcalib_ros.formats.values import (
     RATIONAL,
     Cameras,
     Data,
+    Placed,
     camera_with,
     distortion_model,
     focal_and_centre,
@@ -49,6 +50,7 @@ from dashcalib_ros.formats.values import (
     read_numbers,
     read_pair,
     read_size,
+    with_lenses,
 )
 from dashcalib_ros.judge.difference import NamedCamera
 
@@ -118,7 +120,7 @@ def _kalibr(data: Data, path: Path) -> Camera | OtherLens:
 
 def write_kalibr(found: NamedCamera) -> str:
     """Return a camchain.yaml with one camera. Raises ConfigError."""
-    return str(yaml.safe_dump({'cam0': _kalibr_content(found)}, sort_keys=False,
+    return str(yaml.safe_dump({'cam0': _kalibr_content(found.camera)}, sort_keys=False,
                               default_flow_style=None))
 
 
@@ -128,20 +130,32 @@ def write_openvins(found: NamedCamera) -> str:
     Raises ConfigError.
     """
     pose = [[float(row == column) for column in range(4)] for row in range(4)]
-    content = yaml.dump({'cam0': {'T_imu_cam': pose, **_kalibr_content(found)}}, Dumper=Indented,
-                        sort_keys=False, default_flow_style=None, width=2**20)
+    content = yaml.dump({'cam0': {'T_imu_cam': pose, **_kalibr_content(found.camera)}},
+                        Dumper=Indented, sort_keys=False, default_flow_style=None, width=2**20)
     return f'%YAML:1.0\n---\n{content}'
 
 
-def _kalibr_content(found: NamedCamera) -> dict[str, Any]:
-    camera = found.camera
+def write_kalibr_rig(rig: Sequence[Placed]) -> str:
+    """Return a camchain.yaml of the cameras of a rig. Raises ConfigError."""
+    cameras, last, head = {}, np.eye(4), '# T_cn_cnm1: from the camera before\n'
+    for number, (each, camera) in enumerate(with_lenses(rig, 'kalibr')):
+        content = _kalibr_content(camera, f'/{each.name}/image_raw')
+        if number:
+            content['T_cn_cnm1'] = (each.pose @ np.linalg.inv(last)).tolist()
+        if each.translation_m is None:
+            head += f'# {each.name}: no metres are known, 0 is written\n'
+        cameras[f'cam{number}'], last = content, each.pose
+    return head + str(yaml.safe_dump(cameras, sort_keys=False, default_flow_style=None))
+
+
+def _kalibr_content(camera: Camera, topic: str = '/image_raw') -> dict[str, Any]:
     return {
         'camera_model': 'pinhole',
         'intrinsics': [camera.fx, camera.fy, camera.cx, camera.cy],
         'distortion_model': 'equidistant' if is_fisheye(camera) else 'radtan',
         'distortion_coeffs': list(named_coefficients(camera, 4, 'kalibr').values()),
         'resolution': list(camera.image_size),
-        'rostopic': '/image_raw'}
+        'rostopic': topic}
 
 
 def matlab(data: Any, path: Path) -> Cameras:

@@ -2,6 +2,7 @@
 """COLMAP's cameras.txt, cameras.bin and database. It counts pixels from the first one's corner."""
 from __future__ import annotations
 
+import json
 import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
@@ -10,6 +11,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
+
+import numpy as np
 
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.camera import HALF_PIXEL
@@ -23,17 +26,20 @@ from dashcalib_ros.camera.other import (
     field_of_view,
     undone,
 )
+from dashcalib_ros.camera.rotation import quaternion
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.formats.values import (
     EQUIDISTANT,
     PLUMB_BOB,
     RATIONAL,
     Cameras,
+    Placed,
     Read,
     camera_with,
     distortion_model,
     read_numbers,
     read_size,
+    with_lenses,
 )
 from dashcalib_ros.judge.difference import NamedCamera
 from dashcalib_ros.limits import JSON_BYTES, check_file, read_file
@@ -138,6 +144,28 @@ def write(found: NamedCamera) -> str:
     camera, (width, height) = found.camera, found.image_size
     values = ' '.join(repr(float(value)) for value in camera.colmap.values(camera.params))
     return f'{HEAD}1 {camera.colmap.name} {width} {height} {values}\n'
+
+
+def write_rig(rig: Sequence[Placed]) -> str:
+    """Return a rig_config.json, for rig_configurator: a folder of images for each camera.
+
+    A camera without metres has no pose in it: COLMAP finds that. Raises ConfigError.
+    """
+    found = with_lenses(rig, 'colmap')
+    first, cameras = np.linalg.inv(found[0][0].pose), []
+    for number, (each, camera) in enumerate(found):
+        values: dict[str, Any] = {
+            'image_prefix': f'{each.name}/', 'camera_model_name': camera.colmap.name,
+            'camera_params': [float(value) for value in camera.colmap.values(camera.params)]}
+        if not number:
+            values['ref_sensor'] = True
+        elif each.translation_m is not None and found[0][0].translation_m is not None:
+            pose = each.pose @ first
+            x, y, z, w = quaternion(pose[:3, :3])
+            values |= {'cam_from_rig_rotation': [w, x, y, z],
+                       'cam_from_rig_translation': pose[:3, 3].tolist()}
+        cameras.append(values)
+    return json.dumps([{'cameras': cameras}], indent=2) + '\n'
 
 
 def write_database(found: NamedCamera) -> bytes:

@@ -11,21 +11,26 @@ from __future__ import annotations
 import json
 import math
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
 
+import numpy as np
+
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.camera import HALF_PIXEL
 from dashcalib_ros.camera.other import OtherLens, angles, bent, plane, undone
-from dashcalib_ros.errors import InputError
+from dashcalib_ros.camera.rotation import OPTICAL
+from dashcalib_ros.errors import ConfigError, InputError
 from dashcalib_ros.formats import colmap
 from dashcalib_ros.formats.values import (
     EQUIDISTANT,
     PLUMB_BOB,
     Cameras,
     Data,
+    Placed,
     camera_with,
     distortion_model,
     is_fisheye,
@@ -34,6 +39,7 @@ from dashcalib_ros.formats.values import (
     read_coefficients,
     read_number,
     read_size,
+    with_lenses,
     xml_root,
 )
 from dashcalib_ros.judge.difference import NamedCamera
@@ -168,10 +174,36 @@ def write_nerfstudio(found: NamedCamera) -> str:
 
     Raises ConfigError.
     """
-    camera, (width, height) = found.camera, found.image_size
-    return json.dumps({
-        'camera_model': 'OPENCV_FISHEYE' if is_fisheye(camera) else 'OPENCV',
-        'w': width, 'h': height,
-        'fl_x': camera.fx, 'fl_y': camera.fy, 'cx': camera.cx + HALF_PIXEL,
-        'cy': camera.cy + HALF_PIXEL,
-        **named_coefficients(camera, 5, 'nerfstudio'), 'frames': []}, indent=2) + '\n'
+    return json.dumps({**_nerf_model(found.camera), **_nerf_content(found.camera), 'frames': []},
+                      indent=2) + '\n'
+
+
+def write_nerfstudio_rig(rig: Sequence[Placed]) -> str:
+    """Return a transforms.json with a frame of each camera of a rig, which are to be repeated.
+
+    Its world is the car as the base sees it: x ahead, y to the left, z upwards. Raises ConfigError
+    for fisheyes among other lenses, which it cannot have.
+    """
+    found = with_lenses(rig, 'nerfstudio')
+    model = _nerf_model(found[0][1])
+    if any(_nerf_model(camera) != model for _, camera in found):
+        raise ConfigError('E-RIG-MIXED', 'nerfstudio has one kind of lens for all cameras; use '
+                                         'rig_config.json')
+    turn = np.eye(4)
+    turn[:3, :3] = next((each.mount.rotation for each in rig if each.mount), OPTICAL)
+    return json.dumps({**model, 'frames': [{
+        'file_path': f'{each.name}/', **_nerf_content(camera),
+        # of a camera that looks along -z, y upwards
+        'transform_matrix': (turn @ np.linalg.inv(each.pose) @ np.diag(
+            [1.0, -1.0, -1.0, 1.0])).tolist()} for each, camera in found]}, indent=2) + '\n'
+
+
+def _nerf_model(camera: Camera) -> dict[str, str]:
+    return {'camera_model': 'OPENCV_FISHEYE' if is_fisheye(camera) else 'OPENCV'}
+
+
+def _nerf_content(camera: Camera) -> dict[str, float]:
+    width, height = camera.image_size
+    return {'w': width, 'h': height,
+            'fl_x': camera.fx, 'fl_y': camera.fy, 'cx': camera.cx + HALF_PIXEL,
+            'cy': camera.cy + HALF_PIXEL, **named_coefficients(camera, 5, 'nerfstudio')}

@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from dashcalib_ros.arrays import plain_values
 from dashcalib_ros.errors import InputError, Notice, one_line
+from dashcalib_ros.formats import calibrators, colmap, photogrammetry, urdf
 from dashcalib_ros.formats.ours import codes_of
+from dashcalib_ros.formats.values import Placed
+from dashcalib_ros.judge.calibration import CalibrationData
 from dashcalib_ros.limits import JSON_BYTES, parse_json, path_of, read_text
 from dashcalib_ros.rig.placed import PlacedCamera, RigCalibration, Visible
 from dashcalib_ros.rig.witness import Epipolar
@@ -34,13 +41,53 @@ def rig_json(rig: RigCalibration) -> str:
     return json.dumps(rig_dict(rig), indent=2, allow_nan=False, ensure_ascii=False) + '\n'
 
 
+# by the names of the files beside rig.json: the cameras that have a place, the base first
+RIG_FORMATS: Mapping[str, Callable[[Sequence[Placed]], str]] = {
+    'rig.urdf': urdf.write_rig,
+    'static_transforms.sh': urdf.write_rig_transforms,
+    'camchain.yaml': calibrators.write_kalibr_rig,
+    'rig_config.json': colmap.write_rig,
+    'transforms.json': photogrammetry.write_nerfstudio_rig}
+
+
+def placed_cameras(rig: RigCalibration, calibrations: Mapping[str, CalibrationData]
+                   ) -> list[Placed]:
+    """Return the cameras of a rig that have a place, the base first, for RIG_FORMATS."""
+    found = []
+    for name in sorted(rig.cameras, key=rig.base.__ne__):
+        camera, calibration = rig.cameras[name], calibrations[name]
+        if camera.rotation is None:
+            continue
+        found.append(Placed(
+            name, calibration.camera, camera.rotation,
+            None if camera.translation_m is None else np.array(camera.translation_m),
+            calibration.mount if name == rig.base else None,
+            f'{name}: {camera.verdict}, rotation sigma {camera.rotation_sigma_deg} degrees, '
+            + ('its translation is not known' if camera.translation_m is None else
+               f'translation sigma {camera.translation_sigma_m} m')))
+    return found
+
+
+def _place(path: str | os.PathLike[str]) -> Path:
+    place = path_of(path)
+    return place / RIG if place.is_dir() else place
+
+
+def is_rig(path: str | os.PathLike[str]) -> bool:
+    """Return whether path is a rig.json, by its content, or a folder with one."""
+    try:
+        data = parse_json(read_text(_place(path), JSON_BYTES), str(path))
+    except (InputError, OSError):
+        return False
+    return isinstance(data, dict) and {'base', 'cameras', 'witness'} <= data.keys()
+
+
 def load_rig(path: str | os.PathLike[str]) -> RigCalibration:
     """Read where the cameras of a car sit from path: a rig.json, or its folder.
 
     Raises InputError for what is no rig.json.
     """
-    place = path_of(path)
-    place = place / RIG if place.is_dir() else place
+    place = _place(path)
     data = parse_json(read_text(place, JSON_BYTES), str(place))
     try:
         cameras = {str(name): _camera(values) for name, values in data['cameras'].items()}

@@ -13,6 +13,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
+from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import (
     FISHEYE,
     MODELS,
@@ -26,6 +29,7 @@ from dashcalib_ros.camera import (
 from dashcalib_ros.camera.other import OtherLens
 from dashcalib_ros.errors import ConfigError, InputError, shortened
 from dashcalib_ros.formats.plausible import check_focal, check_lens
+from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.judge.difference import NamedCamera
 from dashcalib_ros.limits import SIDE, check_pixels
 
@@ -130,6 +134,40 @@ def read_coefficients(data: Data, kind: str, path: object) -> list[float]:
                          f'{path} has {", ".join(there)}, but the {kind} model has no '
                          f'{", ".join(more)}; calibrate without')
     return [read_number(data, name, path, 0.0) for name in COEFFICIENTS[kind]]
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A camera of a rig, and where it sits: x' = rotation x + translation_m.
+
+    rotation: (3, 3) from the optical axes of the rig's base to its own; translation_m: (3,), None
+    where no metres are known. camera: None where its lens was refused. mount: of the base.
+    about: a line for people.
+    """
+
+    name: str
+    camera: Camera | None
+    rotation: Floats
+    translation_m: Floats | None
+    mount: Mount | None = None
+    about: str = ''
+
+    @property
+    def pose(self) -> Floats:
+        """Return (4, 4) from the base's axes to its own; no translation where none is known."""
+        found = np.eye(4)
+        found[:3, :3] = self.rotation
+        found[:3, 3] = 0.0 if self.translation_m is None else self.translation_m
+        return found
+
+
+def with_lenses(rig: Sequence[Placed], program: str) -> list[tuple[Placed, Camera]]:
+    """Return the cameras of a rig whose lens is known. Raises ConfigError where that is none."""
+    found = [(each, each.camera) for each in rig if each.camera is not None]
+    if not found:
+        raise ConfigError('E-RIG-NO-LENS', f'{program} needs a lens, and each one of this rig is '
+                                           f'refused: drive more turns')
+    return found
 
 
 def named_coefficients(camera: Camera, most: int, program: str) -> dict[str, float]:

@@ -763,10 +763,10 @@ def imaging_with(camera: Camera, stretches: Sequence[Stretch] = ()) -> Imaging:
     basis = field_basis(camera)
     return Imaging.of(
         Lens(camera), Readout(), Smooth(np.zeros(basis.shape[1]), basis),
-        Shake(axes=_axes_of(stretches)))
+        Shake(axes=steering_axes(stretches)))
 
 
-def _axes_of(stretches: Sequence[Stretch]) -> dict[TurnId, Floats]:
+def steering_axes(stretches: Sequence[Stretch]) -> dict[TurnId, Floats]:
     """Return the axis about which each stretch is steered, (3,), in the camera's axes.
 
     A gentle one has that of the sharpest turn; without any, the vertical of upright pictures.

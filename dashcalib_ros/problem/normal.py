@@ -8,7 +8,7 @@ shared.
 """
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -236,15 +236,9 @@ def normal_equations(linear: Linear, variance: float = 1.0, kept: Sequence[str] 
     rest = np.concatenate([*(extras[name] for name in kept if name in extras),
                            np.arange(own * len(linear.images), len(whole))])
     inner, right = whole[np.ix_(first, first)], whole[np.ix_(first, rest)]
-    at = 0
-    for name in gone:
-        place = slice(at, at := at + len(extras[name]))
-        if name != 'pose':
-            block = linear.imaging.blocks[name]
-            assert isinstance(block, ImageBlock)
-            precision, off = block.prior_of(linear.stretch)
-            inner[place, place] += variance * precision
-            right[place, -1] -= variance * (precision @ off)
+    for place, precision, off in _priors(linear, gone):
+        inner[place, place] += variance * precision
+        right[place, -1] -= variance * (precision @ off)
     solved = _pose_solution(inner, right, linear.stretch)
     left = whole[np.ix_(rest[:-1], rest)] - right[:, :-1].T @ solved
     size, places = len(left), {}
@@ -272,14 +266,32 @@ class PosesGivenShared:
 
 
 def poses_given_shared(linear: Linear, variance: float) -> PosesGivenShared:
-    """Return what a stretch without blocks of images says of its poses; variance: px^2."""
+    """Return what a stretch says of its poses, its blocks of images free; variance: px^2."""
     whole, _ = linear.without_points
-    poses, count = linear.extras['pose'], POSE * len(linear.images)
-    inner, shared = whole[np.ix_(poses, poses)], whole[poses, linear.own * len(linear.images):-1]
-    right = np.concatenate([variance * np.eye(count), shared], axis=1)
-    solved = _pose_solution(inner, right, linear.stretch)
+    gone = [name for name in linear.extras if name != 'motion']
+    first = np.concatenate([linear.extras[name] for name in gone])
+    inner = whole[np.ix_(first, first)]
+    for place, precision, _ in _priors(linear, gone):
+        inner[place, place] += variance * precision
+    count, shared = POSE * len(linear.images), whole[first, linear.own * len(linear.images):-1]
+    right = np.concatenate([variance * np.eye(len(first), count), shared], axis=1)
+    solved = _pose_solution(inner, right, linear.stretch)[:count]
     covariance = solved[:, :count]
     return PosesGivenShared((covariance + covariance.T) / 2, -solved[:, count:])
+
+
+def _priors(linear: Linear, names: Sequence[str]) -> Iterator[tuple[slice, Floats, Floats]]:
+    """Yield the place, the information of the prior, and how far it is off, of blocks of images.
+
+    names: of the blocks, in their order; of poses nothing is known before.
+    """
+    at = 0
+    for name in names:
+        place = slice(at, at := at + len(linear.extras[name]))
+        if name != 'pose':
+            block = linear.imaging.blocks[name]
+            assert isinstance(block, ImageBlock)
+            yield place, *block.prior_of(linear.stretch)
 
 
 def damping(diagonals: Floats, radius: float) -> Floats:

@@ -100,8 +100,12 @@ def difference_html(found: Comparison) -> str:
     """Return a page of two calibrations: where in the picture they differ, and beyond chance."""
     head, rows = comparison_rows(found)
     return template('compare.html').render(
-        sides=(('A', found.a), ('B', found.b)), answers=answers(found),
-        head=head, rows=rows, maps=_maps(found))
+        title='Two calibrations', answers=answers(found), head=head, rows=rows,
+        maps=_maps(found), drawn='Over the picture', told='Parameters',
+        overlines=[f'{side}: {each.name}' + (f' ({each.verdict})' if each.verdict else '')
+                   for side, each in (('A', found.a), ('B', found.b))],
+        note=f'For images of {found.b.image_size[0]} × {found.b.image_size[1]} px. Parameters '
+             f'make up for each other: what counts is how far apart the rays are.')
 
 
 def notebook_html(word: str, lines: Iterable[str], head: Sequence[str],

@@ -10,7 +10,6 @@ import numpy as np
 
 from dashcalib_ros.judge import CalibrationData, TurnSummary, Verdict
 from dashcalib_ros.judge.calibration import Condition, Mount, Witnesses
-from dashcalib_ros.judge.rig import Rig
 
 ADVICE = {
     'accepted': 'Good to use.',
@@ -88,19 +87,6 @@ def mounts_text(mount: Mount, other: Mount) -> str:
     parts = [angle_text(name, *apart) for name, apart in mount.apart(other).items()]
     moved = 'the camera was moved' if mount.moved_from(other) else 'it sits as before'
     return f'mounting: differs by {", ".join(parts)}: {moved}'
-
-
-def rig_texts(rig: Rig) -> list[str]:
-    """Return how camera B is turned against camera A, and whether both saw one drive."""
-    parts = [angle_text(name, *rig.angles.get(name, (None, None))) for name in WAYS]
-    turns = ', '.join(f'{turn.a_right_deg:+.1f}° and {turn.b_right_deg:+.1f}° at '
-                      f'{turn.a_stamp_s:.1f} s' for turn in rig.turns)
-    return [f'B against A on the car: {", ".join(parts)}', {
-        None: 'no turn at the same time: nothing shows that both are of one drive',
-        True: f'both took the same turns, to the right: {turns}',
-        False: f'CONTRADICTION: in turns at the same time the car turns, to the right: {turns}; '
-               f'the pictures of one camera are mirrored or upside down, or its clock is wrong, '
-               f'or it is of another drive'}[rig.agrees]]
 
 
 def verdict_text(mount: Mount) -> str:

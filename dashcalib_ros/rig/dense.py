@@ -7,7 +7,7 @@ A lens needs keyframes far apart, a rig poses at times that its cameras share: b
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from dashcalib_ros.arrays import Mask
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.input import Frame
-from dashcalib_ros.problem.blocks import Imaging, Lens, Readout
+from dashcalib_ros.problem.blocks import Imaging, Lens, Readout, Shake, steering_axes
 from dashcalib_ros.problem.observations import Structure
 from dashcalib_ros.problem.steps import FIRST_RADIUS, State, Stepping, optimised
 from dashcalib_ros.reconstruct.register import register_tracks
@@ -36,8 +36,16 @@ TRACKS = 1200
 LOSS, LEAST_LOSS_PX = 1.0, 0.05
 
 
+@dataclass(frozen=True)
+class Retraced:
+    """A scene with every image as a keyframe, and how each of them shakes."""
+
+    scene: Scene
+    shake: Shake
+
+
 def retraced(frames: Sequence[Frame], scene: Scene, solution: Solution, config: Config,
-             valid: Mask | None = None) -> Scene | None:
+             valid: Mask | None = None) -> Retraced | None:
     """Return a scene with all of these images as keyframes, and the solution's lens.
 
     Its tracks are without the field, and as imaging_of() sees them. frames: resized as the
@@ -70,10 +78,13 @@ def retraced(frames: Sequence[Frame], scene: Scene, solution: Solution, config: 
             return None
         found = replace(whole, tracks=tracks)
         state = State(imaging, (found,))
-        [moved] = optimised(state, Stepping(loss_of(state), STEPS, unit=1.0,
-                                            radius=FIRST_RADIUS)).stretches
-        found = replace(found, structure=moved.structure)
-    return found
+        loss_px = loss_of(state)
+        # the prior of the shakes counts beside the noise
+        state = optimised(state, Stepping(loss_px, STEPS, radius=FIRST_RADIUS))
+        imaging, found = state.imaging, replace(found, structure=state.stretches[0].structure)
+    shake = imaging.blocks[Shake.name]
+    assert isinstance(shake, Shake)
+    return Retraced(found, shake)
 
 
 def loss_of(state: State) -> float:
@@ -83,6 +94,11 @@ def loss_of(state: State) -> float:
 
 
 def imaging_of(solution: Solution, held: bool = False) -> Imaging:
-    """Return what takes a solution's pictures, the field apart. held: nothing of it moves."""
-    return Imaging.of(Lens(solution.camera.widened(), held=held), Readout(
-        np.array([solution.readout_s]), held=held))
+    """Return what takes a solution's pictures, the field apart, as it was solved.
+
+    held: what the images share does not move.
+    """
+    return Imaging.of(
+        Lens(solution.camera.widened(), held=held),
+        Readout(np.array([solution.readout_s]), held=held),
+        Shake(axes=steering_axes(solution.scenes), readout_s=solution.readout_s))

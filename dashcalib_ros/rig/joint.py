@@ -10,6 +10,8 @@ mostly the base's, says where it must be at that time:
 P, T: the base's pose; m: metres in a unit of its scene; G, g, s: the similarity between both
 scenes. The unknowns are each camera's rotation, translation and clock, m, the similarities, and
 each camera's lens, with the covariance that all of its turns give it: poses follow their lens.
+In the end each lens is put back to what its own turns say, which is what is judged and written:
+on rendered rigs the paths move it to no better place. Its covariance stays in that of places.
 
 Beside the scenes' own noise there is what else no model has, at every keyframe, and how the car
 shook between two keyframes of the reference: as large as the residuals say. So cameras with one
@@ -26,6 +28,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats, Ints
 from dashcalib_ros.camera.rotation import rotation_matrices
+from dashcalib_ros.judge.difference import distance
 from dashcalib_ros.problem.trajectory import cross, logarithms
 from dashcalib_ros.rig.paths import CameraPaths, ScenePath
 
@@ -345,14 +348,16 @@ class Problem:
 
 @dataclass(frozen=True)
 class Solved:
-    """The optimum. covariance: (m, m); own: by camera, what each group alone says.
+    """The optimum given each camera's own lens. covariance: (m, m); own: by camera, by group.
 
     Of a group these are (PLACE,) how far it is off all, and (PLACE,) its variances.
+    lens_distance: by camera, by how many of its own sigmas paths would move its lens.
     """
 
     problem: Problem
     covariance: Floats
     own: Mapping[str, Sequence[tuple[Floats, Floats]]]
+    lens_distance: Mapping[str, float]
 
     def sigma(self, name: str) -> Floats:
         """Return (PLACE,) the sigmas of a camera, larger where its stretches differ by more."""
@@ -395,7 +400,23 @@ def solved(problem: Problem) -> Solved:
         for name in {problem.pairs[n].other[0] for n in members}:
             place = problem.where[name]
             own[name].append((away[place], np.diag(alone)[place]))
-    return Solved(problem, covariance, own)
+    distances = {name: distance(value, problem.cameras[name].lens_covariance)
+                 for name, value in problem.lenses.items()}
+    return Solved(*_with_own_lenses(problem, covariance), own, distances)
+
+
+def _with_own_lenses(problem: Problem, covariance: Floats) -> tuple[Problem, Floats]:
+    """Return the optimum where no lens moves, and its covariance (m, m) with those of lenses."""
+    count, where = len(covariance), problem.where
+    step, known = np.zeros(count), np.zeros((count, count))
+    for name, value in problem.lenses.items():
+        place = where['lens', name]
+        step[place], known[place, place] = -value, problem.cameras[name].lens_covariance
+    lens = np.concatenate([np.arange(count)[where['lens', name]] for name in problem.lenses])
+    # how all follows the lenses
+    follow = np.linalg.solve(covariance[np.ix_(lens, lens)], covariance[lens]).T
+    left = covariance - follow @ covariance[lens]
+    return problem.moved(follow @ step[lens]), left + follow @ known[np.ix_(lens, lens)] @ follow.T
 
 
 def _step(problem: Problem, groups: Sequence[Rows]) -> tuple[Floats, Floats, float]:

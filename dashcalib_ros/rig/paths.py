@@ -18,7 +18,7 @@ from dashcalib_ros.problem.normal import linearised, poses_given_shared
 from dashcalib_ros.problem.steps import State
 from dashcalib_ros.problem.trajectory import Trajectory, logarithms
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.rig.dense import imaging_of, loss_of
+from dashcalib_ros.rig.dense import Retraced, imaging_of, loss_of
 from dashcalib_ros.solve.solution import Solution
 
 # of a scene at the least; with fewer it says nothing of a rig
@@ -80,18 +80,19 @@ class CameraPaths:
 LEAST_READOUT_SIGMA_S = 1e-5
 
 
-def camera_paths(name: str, solution: Solution, scenes: Sequence[Scene], start_s: float
+def camera_paths(name: str, solution: Solution, stretches: Sequence[Retraced], start_s: float
                  ) -> CameraPaths:
-    """Return what a camera knows of the car's path. scenes: as retraced() returns them."""
+    """Return what a camera knows of the car's path."""
     imaging, found, start_ns = imaging_of(solution), [], round(start_s * 1e9)
-    for scene in sorted(scenes, key=lambda each: int(each.tracks.stamps_ns[0])):
+    for each in sorted(stretches, key=lambda each: int(each.scene.tracks.stamps_ns[0])):
+        scene = each.scene
         rows, structure = scene.observed.keyframes, scene.structure
         path = Trajectory(
             (scene.tracks.stamps_ns[rows] - start_ns) / 1e9, structure.rotations[rows],
             structure.translations[rows], np.arange(len(rows)), len(rows), True)
         if len(rows) < LEAST_POSES or not np.all(np.diff(path.seconds) > 0):
             continue
-        state = State(imaging, (scene,))
+        state = State(imaging.having(each.shake), (scene,))
         loss_px = loss_of(state)
         known = poses_given_shared(
             linearised(state.seen[0], loss_px), state.noise(loss_px).variance)

@@ -2,6 +2,8 @@
 """The result: where each camera sits, with a verdict for each degree of freedom."""
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
@@ -13,6 +15,7 @@ from dashcalib_ros.camera.rotation import rotation_matrices, rotation_vectors
 from dashcalib_ros.config import RigConfig
 from dashcalib_ros.errors import Notice
 from dashcalib_ros.judge.calibration import Level
+from dashcalib_ros.judge.difference import limit_of
 from dashcalib_ros.rig.joint import REACH_M, Solved
 from dashcalib_ros.rig.start import LEAST_EXPLAINED, Aligned
 from dashcalib_ros.rig.witness import Epipolar
@@ -34,6 +37,10 @@ LEAST_STRETCHES = 2
 # times its sigmas: stretches that differ by more contradict each other
 DISAGREE = 3.0
 AXES = ('x', 'y', 'z')
+# degrees to the left, by words of a camera's name; and how far off it may look: the left one of a
+# stereo pair looks ahead
+SIDES = {'front': 0.0, 'left': 90.0, 'right': -90.0, 'rear': 180.0, 'back': 180.0}
+ELSEWHERE_DEG = 110.0
 
 
 @dataclass(frozen=True)
@@ -90,12 +97,34 @@ class RigCalibration:
         return all(camera.verdict == 'accepted' for camera in self.cameras.values())
 
 
-def base_camera(calibration: str, level: Level) -> PlacedCamera:
-    """Return the base, which sits at its own place."""
+def lens_doubts(name: str, level: Level) -> tuple[Notice, ...]:
+    """Return why a camera's lens keeps its rotation from being accepted; nothing where none."""
+    return () if level == 'accepted' else (Notice(
+        'E-RIG-LENS', f'{name}: its lens is {level}, so its rotation is weak at best: drive turns '
+        f'in which it sees more'),)
+
+
+def apart_doubts(name: str, solved: Solved) -> tuple[Notice, ...]:
+    """Return that a rig's paths ask for another lens than a camera's own turns allow, or none."""
+    return () if solved.lens_distance[name] <= limit_of(
+        len(solved.problem.lenses[name])) else (Notice(
+            'E-RIG-LENS-APART', f'{name}: the other cameras ask for another lens than its own '
+            f'turns show: check that it was not moved during the drive, or drive more turns'),)
+
+
+def base_doubts(name: str, base: str, doubts: Sequence[Notice]) -> tuple[Notice, ...]:
+    """Return why the base keeps a camera's rotation against it from being accepted."""
+    return () if not doubts else (Notice(
+        'E-RIG-BASE', f'{name}: the lens of {base}, against which it is placed, is not accepted: '
+        f'choose another --base, or see what {base} needs'),)
+
+
+def base_camera(calibration: str, doubts: Sequence[Notice] = ()) -> PlacedCamera:
+    """Return the base, which sits at its own place. doubts: about its lens."""
     zero: Three = (0.0, 0.0, 0.0)
     sure: Sights = ('accepted', 'accepted', 'accepted')
-    return PlacedCamera(calibration, 'weak' if level == 'refused' else 'accepted', zero, zero,
-                        zero, zero, 0.0, 0.0, Visible(sure, sure, 'accepted'))
+    return PlacedCamera(calibration, 'weak' if doubts else 'accepted', zero, zero, zero, zero, 0.0,
+                        0.0, Visible(sure, sure, 'accepted'), tuple(doubts))
 
 
 def not_placed(calibration: str, reason: Notice) -> PlacedCamera:
@@ -120,19 +149,19 @@ def why_not_aligned(name: str, base: str, found: Aligned | None, scenes: int) ->
                   f'both clips are of one drive and one car')
 
 
-def placed(name: str, calibration: str, level: Level, solved: Solved, metric: bool,
-           clock: float, limits: RigConfig, doubts: Sequence[Notice] = ()) -> PlacedCamera:
+def placed(name: str, calibration: str, solved: Solved, metric: bool, clock: float,
+           limits: RigConfig, doubts: Sequence[Notice] = ()) -> PlacedCamera:
     """Return where a camera sits.
 
-    level: of its lens. metric: whether metres are known. clock: s by which its stamps begin after
-    the base's. doubts: what else keeps it from being accepted.
+    metric: whether metres are known. clock: s by which its stamps begin after the base's. doubts:
+    what keeps it from being accepted, whatever its sigmas.
     """
     place, groups = solved.problem.places[name], solved.own[name]
     sigma = solved.sigma(name)[:7] * np.r_[np.degrees(np.ones(3)), np.ones(4)]
     sigma = np.hypot(sigma, STRETCH / np.sqrt(max(len(groups), 1)))
     apart = solved.disagreement(name)[:7] > DISAGREE
     most = np.repeat([limits.rotation_deg, limits.translation_m, limits.clock_s], (3, 3, 1))
-    alone = len(groups) < LEAST_STRETCHES or level == 'refused' or bool(doubts)
+    alone = len(groups) < LEAST_STRETCHES or bool(doubts)
     sights: list[Sight] = []
     for value, limit, differs in zip(sigma, most, apart, strict=True):
         if value > WEAK * limit:
@@ -150,24 +179,40 @@ def placed(name: str, calibration: str, level: Level, solved: Solved, metric: bo
                       'refused' if 'not visible' in visible.rotation else 'weak')
     return PlacedCamera(
         calibration, verdict,
-        _three(np.degrees(rotation_vectors(place.rotation[None])[0])), _three(sigma[:3]),
-        _three(place.translation_m) if metric else None,
-        _three(sigma[3:6]) if metric else None, place.late_s + clock, float(sigma[6]), visible,
-        (*doubts, *_reasons(name, visible, len(groups), level, apart, sigma, metric)))
+        three(np.degrees(rotation_vectors(place.rotation[None])[0])), three(sigma[:3]),
+        three(place.translation_m) if metric else None,
+        three(sigma[3:6]) if metric else None, place.late_s + clock, float(sigma[6]), visible,
+        (*doubts, *_reasons(name, visible, len(groups), apart, sigma, metric)))
 
 
-def _three(values: Floats) -> Three:
+def misnamed(cameras: Mapping[str, PlacedCamera], car: Floats) -> tuple[Notice, ...]:
+    """Return which cameras look elsewhere than their names say.
+
+    car: (3, 3) from the base's optical axes to the car's: x ahead, y to the left.
+    """
+    found = []
+    for name, camera in cameras.items():
+        sides = [SIDES[word] for word in re.split('[-_]', name.lower()) if word in SIDES]
+        if len(sides) == 1 and camera.rotation is not None:
+            ahead, left, _ = (car @ camera.rotation[2]).tolist()
+            yaw = math.degrees(math.atan2(left, ahead))
+            if abs(math.remainder(yaw - sides[0], 360)) > ELSEWHERE_DEG:
+                found.append(Notice('E-RIG-SIDE', f'{name} looks {abs(yaw):.0f} degrees to the '
+                                    f'{"left" if yaw > 0 else "right"} of ahead: check that no '
+                                    f'two inputs were exchanged'))
+    return tuple(found)
+
+
+def three(values: Floats) -> Three:
+    """Return the three values of an array."""
     x, y, z = values.tolist()
     return x, y, z
 
 
-def _reasons(name: str, visible: Visible, stretches: int, level: Level, apart: Mask,
-             sigma: Floats, metric: bool) -> tuple[Notice, ...]:
+def _reasons(name: str, visible: Visible, stretches: int, apart: Mask, sigma: Floats,
+             metric: bool) -> tuple[Notice, ...]:
     """Return what is not accepted, and what would show it."""
     found = []
-    if level == 'refused':
-        found.append(Notice('E-RIG-LENS', f'{name}: its lens is refused, so its rotation is weak '
-                            f'at best: drive turns in which it sees more'))
     if stretches < LEAST_STRETCHES:
         found.append(Notice('E-RIG-ONE-STRETCH', f'{name}: one stretch alone shows where it sits, '
                             f'and nothing confirms it: drive more turns'))

@@ -39,8 +39,10 @@ from dashcalib_ros.cli.terminal import show, warn
 from dashcalib_ros.config import Config
 from dashcalib_ros.demo import DEMOS
 from dashcalib_ros.formats.export import EXPORTS
+from dashcalib_ros.formats.rig import rig_json
 from dashcalib_ros.report import write_results
 from dashcalib_ros.report.tables import line
+from dashcalib_ros.rig.placed import PlacedCamera, RigCalibration, base_camera
 from dashcalib_ros.workers.worker import THREAD_VARIABLES
 
 HEAVY = ('numpy', 'cv2', 'scipy', 'yaml', 'rich', 'matplotlib', 'pycolmap', 'rosbags', 'rclpy')
@@ -252,24 +254,34 @@ def test_compare_as_json(here, results):
     assert data['a']['verdict'] == 'accepted'
 
 
-def test_two_cameras_of_one_car(here, results):
+def test_two_rigs_of_one_car(here, tmp_path):
+    rig = RigCalibration('front', {'front': base_camera('front/result.json'), 'rear': PlacedCamera(
+        'rear/result.json', 'accepted', (2.0, 177.5, 1.5), (0.05, 0.05, 0.05))})
+    turned = replace(rig.cameras['rear'], rotation_deg=(2.0, 176.0, 1.5))
+    for name, each in (('a', rig), ('b', replace(rig, cameras={**rig.cameras, 'rear': turned}))):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / 'rig.json').write_text(rig_json(each))
+    old = shutil.copy(tmp_path / 'a/rig.json', tmp_path / 'old.json')
+    told = here('compare', tmp_path / 'b', old)
+    assert (told.returncode, told.stderr) == (0, '') and 'answer: wrong' in told.stdout
+    data = json.loads(here('compare', tmp_path / 'b', old, '--json').stdout)
+    assert data['answer'] == 'wrong' and data['cameras']['rear']['perhaps'] is True
+    assert abs(data['cameras']['rear']['rotation_deg'][1]) == pytest.approx(1.5, abs=0.1)
+    assert json.loads(here('compare', tmp_path / 'a', old, '--json').stdout)['answer'] == 'right'
+    camera = tmp_path / 'camera.json'
+    camera.write_text('{"fx": 700, "fy": 700, "cx": 320, "cy": 240, "width": 640, "height": 480}')
+    for code, *args in (('E-RIG-FILE', camera), ('E-RIG-HTML', old, '--html', camera)):
+        refused = here('compare', tmp_path / 'a', *args)
+        assert_one_line_error(refused)
+        assert f'[{code}]' in refused.stderr
+
+
+def test_mountings_are_exported(here, results):
     for name, mount in (('front', MOUNT), ('rear', replace(MOUNT, yaw_left_deg=179.0))):
         turn = replace(make_calibration().turns[0], right_deg=88.0)
         write_results(make_calibration(mount=mount, turns=(turn,)), results / name)
         urdf = here('export', results / name, '--to', 'urdf', '--out', results / f'{name}.urdf')
         assert (urdf.returncode, urdf.stdout, urdf.stderr) == (0, '', '')
-    told = here('compare', results / 'front', results / 'rear', '--rig')
-    assert (told.returncode, told.stderr) == (0, '')
-    assert 'yaw 177.00 ± 0.14° to the left' in ' '.join(told.stdout.split())
-    data = json.loads(here('compare', results / 'front', results / 'rear/result.json', '--rig',
-                           '--json').stdout)
-    assert data['agrees'] is True and data['angles']['yaw_left_deg'][0] == pytest.approx(177.0)
-    assert np.shape(data['rotation']) == (3, 3) and data['turns'][0]['b_right_deg'] == 88.0
-    for code, *args in (('E-RIG-NO-MOUNTING', 'a', '--rig'),
-                        ('E-RIG-HTML', 'rear', '--rig', '--html', results / 'page.html')):
-        refused = here('compare', results / 'front', results / args[0], *args[1:])
-        assert_one_line_error(refused)
-        assert f'[{code}]' in refused.stderr
     refused = here('export', results / 'a', '--to', 'urdf')
     assert_one_line_error(refused)
     assert '[E-EXPORT-NO-MOUNTING]' in refused.stderr

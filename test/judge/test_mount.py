@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_calibration import make_calibration
+from made_calibration import MOUNT, make_calibration
 from made_lines import made_lines
 from scipy.spatial.transform import Rotation
 from solving import LENS, scenes_of, solved, with_camera, with_covariance
@@ -61,6 +61,14 @@ def test_a_camera_that_looks_back_is_half_a_turn_about_the_vertical(solution, an
     np.testing.assert_allclose(back.rotation, np.diag([-1, -1, 1]) @ ahead.rotation, atol=2e-3)
     assert back.verdict == ahead.verdict
     np.testing.assert_allclose(back.travel_px, ahead.travel_px, atol=1)
+
+
+def test_mountings_are_apart_by_the_short_way_across_180_degrees():
+    rear = replace(MOUNT, yaw_left_deg=-178.0)
+    found = rear.apart(replace(MOUNT, yaw_left_deg=179.9))
+    # MOUNT does not know its roll
+    assert set(found) == {'yaw_left_deg', 'pitch_up_deg'}
+    assert found['yaw_left_deg'] == pytest.approx((2.1, 0.1 * 2**0.5))
 
 
 def test_a_car_that_drives_both_ways_does_not_say_where_it_looks(solution):

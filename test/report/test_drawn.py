@@ -17,7 +17,7 @@ import pycolmap
 import pytest
 import yaml
 from drawn import START_S, drawn_calibration, solution
-from made_calibration import EACH_MODEL, calibration_of, make_calibration
+from made_calibration import EACH_MODEL, MOUNT, calibration_of, make_calibration
 from made_drives import smooth, write_folder
 from page_reader import Page
 from solving import CONFIG, only
@@ -32,7 +32,7 @@ from dashcalib_ros.judge.agreement import focal_of_turns, sigma_by_count
 from dashcalib_ros.judge.calibration import Condition, Shutter, Stabiliser, StoredTurnSummary
 from dashcalib_ros.judge.verdict import RULES, judge
 from dashcalib_ros.report import NamedCamera, report_html, write_results
-from dashcalib_ros.report.lens import WHY_TOGETHER, undistorted
+from dashcalib_ros.report.lens import WHY_TOGETHER, mounting_of, undistorted
 from dashcalib_ros.report.turns import picture_svg
 from dashcalib_ros.report.wording import conditions
 from dashcalib_ros.session import with_source
@@ -397,3 +397,12 @@ def test_the_field_of_view_is_that_of_the_lens():
     across, down, diagonal = plain.field_of_view
     assert (across, down) == pytest.approx((90, 90)) and diagonal > 90
     assert EACH_MODEL['fisheye'].field_of_view[0] > 150
+
+
+def test_a_camera_that_looks_back_is_drawn_so():
+    rear = dataclasses.replace(MOUNT, yaw_left_deg=-178.0, pitch_up_deg=3.0)
+    ahead, back = (mounting_of(make_calibration(mount=mount)) for mount in (MOUNT, rear))
+    assert 'from which the car comes' in back[2].caption
+    for seen, turned_back in zip(ahead, back, strict=True):
+        assert 'comes' not in seen.svg + seen.caption and seen.svg != turned_back.svg
+    assert all('where the car comes from' in drawing.svg for drawing in back[:2])

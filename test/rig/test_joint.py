@@ -8,11 +8,20 @@ import numpy as np
 import pytest
 from made_rig import SPEED, Mounted, made_paths
 
-from dashcalib_ros.camera.rotation import rotation_matrices, rotation_vectors
+from dashcalib_ros.camera.rotation import OPTICAL, rotation_matrices, rotation_vectors
 from dashcalib_ros.config import RigConfig
 from dashcalib_ros.rig.joint import Solved, solved
 from dashcalib_ros.rig.paths import CameraPaths
-from dashcalib_ros.rig.placed import placed, why_not_aligned
+from dashcalib_ros.rig.placed import (
+    PlacedCamera,
+    apart_doubts,
+    base_camera,
+    base_doubts,
+    lens_doubts,
+    misnamed,
+    placed,
+    why_not_aligned,
+)
 from dashcalib_ros.rig.start import aligned, problem_of
 
 CAMERAS = {
@@ -71,24 +80,70 @@ def test_a_rotation_about_the_vertical_is_known_no_better_than_the_lenses():
 def test_a_flat_road_shows_no_height_and_no_metres_without_a_speed():
     best, _ = rig_of(yaws=(85.0, -75.0))
     assert best.sigma('rear')[4] > 3 * best.sigma('rear')[[3, 5]].max()
-    found = placed('rear', 'rear/result.json', 'accepted', best, True, 0.0, RigConfig())
+    found = placed('rear', 'rear/result.json', best, True, 0.0, RigConfig())
     assert found.visible.rotation == ('accepted',) * 3 and found.verdict == 'accepted'
     assert found.translation_m is not None and abs(found.translation_m[2] + 2.0) < 0.05
     best, _ = rig_of(yaws=(85.0, -75.0), metres=None)
-    found = placed('rear', 'rear/result.json', 'accepted', best, False, 0.0, RigConfig())
+    found = placed('rear', 'rear/result.json', best, False, 0.0, RigConfig())
     assert found.translation_m is None and found.verdict == 'accepted'
     assert 'E-RIG-NO-METRES' in [reason.code for reason in found.reasons]
 
 
 def test_one_stretch_or_a_refused_lens_is_weak():
     best, _ = rig_of(yaws=(85.0,))
-    found = placed('rear', '', 'accepted', best, True, 0.0, RigConfig())
+    found = placed('rear', '', best, True, 0.0, RigConfig())
     assert found.verdict == 'weak'
     assert 'E-RIG-ONE-STRETCH' in [reason.code for reason in found.reasons]
     best, _ = rig_of(yaws=(85.0, -75.0))
-    found = placed('rear', '', 'refused', best, True, 0.0, RigConfig())
-    assert found.verdict == 'weak' and found.rotation_deg is not None
-    assert [reason.code for reason in found.reasons] == ['E-RIG-LENS']
+    assert not lens_doubts('rear', 'accepted') and not base_doubts('rear', 'front', ())
+    for doubts, code in ((lens_doubts('rear', 'refused'), 'E-RIG-LENS'),
+                         (base_doubts('rear', 'front', lens_doubts('front', 'weak')),
+                          'E-RIG-BASE')):
+        found = placed('rear', '', best, True, 0.0, RigConfig(), doubts)
+        assert found.verdict == 'weak' and found.rotation_deg is not None
+        assert [reason.code for reason in found.reasons] == [code]
+
+
+def test_cameras_that_look_elsewhere_than_they_are_called_are_named():
+    def looking(**yaws_left):
+        return {name: PlacedCamera('', 'accepted', (0.0, float(yaw), 0.0), (0.1, 0.1, 0.1))
+                for name, yaw in yaws_left.items()}
+
+    def named(ahead_deg=0.0, **yaws_left):
+        car = rotation_matrices(np.radians([[0.0, 0.0, ahead_deg]]))[0] @ OPTICAL
+        found = misnamed(looking(**yaws_left), car)
+        assert all(each.code == 'E-RIG-SIDE' for each in found)
+        return [str(each).split()[0] for each in found]
+
+    assert not named(front=0, left=70, rear=178, side=100)
+    # of a stereo pair, and where the base looks back
+    assert not named(left=0, right=0.5) and not named(180.0, rear=0, front=180)
+    assert named(front=0, left=-80, right=75) == ['left', 'right']
+    assert named(180.0, front=0, rear=179) == ['front', 'rear']
+
+
+@pytest.mark.parametrize('level', ['weak', 'refused'])
+def test_a_base_is_no_surer_than_its_lens(level):
+    found = base_camera('front/result.json', lens_doubts('front', level))
+    assert found.verdict == 'weak' and [each.code for each in found.reasons] == ['E-RIG-LENS']
+    assert base_camera('front/result.json').verdict == 'accepted'
+
+
+def test_lenses_stay_as_their_own_turns_say():
+    paths, lenses = made_paths({name: CAMERAS[name] for name in ('front', 'rear')},
+                               yaws=(85.0, -75.0))
+    found = {'rear': aligned(paths['rear'], paths['front'])}
+    best = solved(problem_of(paths, 'front', found, speed))
+    assert all(np.abs(value).max() < 1e-9 for value in best.problem.lenses.values())
+    assert not apart_doubts('rear', best) and not apart_doubts('front', best)
+    # a lens that its own turns call much better than it is
+    own = paths['rear'].lens_covariance
+    paths['rear'] = replace(paths['rear'], lens_covariance=own / 10**2)
+    paths['front'] = replace(paths['front'], lens_covariance=own / 10**2)
+    assert abs(lenses['rear'][2] - lenses['front'][2]) > 0.5
+    best = solved(problem_of(paths, 'front', found, speed))
+    assert 'E-RIG-LENS-APART' in [each.code for name in ('front', 'rear')
+                                  for each in apart_doubts(name, best)]
 
 
 def test_a_camera_that_was_moved_between_two_turns_is_not_accepted():
@@ -102,7 +157,7 @@ def test_a_camera_that_was_moved_between_two_turns_is_not_accepted():
         paths['rear'].scenes[0], replace(moved, trajectory=trajectory)))
     found = {'rear': aligned(paths['rear'], paths['front'])}
     best = solved(problem_of(paths, 'front', found, speed))
-    result = placed('rear', '', 'accepted', best, True, 0.0, RigConfig())
+    result = placed('rear', '', best, True, 0.0, RigConfig())
     assert result.verdict != 'accepted'
     assert 'E-RIG-DISAGREE' in [reason.code for reason in result.reasons]
 

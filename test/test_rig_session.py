@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of two cameras of one car, ahead and back, with exact truth: from drives to a rig."""
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from shared_drive import LENS, QUICK, SPEC
+
+from dashcalib_ros import rig_session
+from dashcalib_ros.camera.rotation import rotation_vectors
+from dashcalib_ros.cli.rig import write_rig
+from dashcalib_ros.demo import Drive, Mounting, render_to_bag, true_places
+from dashcalib_ros.formats import load_camera
+from dashcalib_ros.formats.rig import RIG_FORMATS, load_rig
+from dashcalib_ros.input.motion import Samples, SensorStream
+from dashcalib_ros.judge import Verdict
+
+BACK = replace(SPEC, rolling_shutter_ms=12.0, mounting=Mounting(
+    178.0, -3.0, 1.0, -0.9, -0.1, 1.2, phase_s=0.05, late_s=0.3))
+
+
+@pytest.fixture(scope='module')
+def placed(shared_drive, tmp_path_factory):
+    """The rig, and what it was made of: drives, and what went into each camera's path."""
+    folder, kept = tmp_path_factory.mktemp('rig'), {}
+    drives = {'front': shared_drive, 'rear': Drive(LENS, BACK)}
+    for name, drive in drives.items():
+        render_to_bag(drive, folder / name)
+    ride = shared_drive.ride
+    times = np.arange(0.0, ride.duration - 0.2, 0.05)
+    speed = np.gradient(np.interp(times + 0.1, ride.t, ride.s), times)
+
+    def keeping(*given):
+        kept[given[0]] = given
+        return before(*given)
+
+    before = rig_session.camera_paths
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rig_session, 'camera_paths', keeping)
+        found = rig_session.calibrate_rig(
+            {name: folder / name for name in drives}, config=QUICK,
+            motion=SensorStream(speed=Samples(times, speed[:, None])))
+    return found, drives, kept
+
+
+def test_pictures_show_where_a_camera_sits(placed):
+    found, drives, _ = placed
+    true, rear = true_places(drives, 'front')['rear'], found.rig.cameras['rear']
+    off = np.degrees(rotation_vectors((rear.rotation @ true.rotation.T)[None])[0])
+    assert np.all(np.abs(off) < 3.5 * np.array(rear.rotation_sigma_deg))
+    assert max(rear.rotation_sigma_deg) < 0.3 and rear.visible.rotation == ('accepted',) * 3
+    assert abs(rear.time_offset_s - true.time_offset_s) < 3.5 * rear.time_sigma_s < 0.01
+    away = np.array(rear.translation_m) - true.translation_m
+    assert np.all(np.abs(away) < 3.5 * np.array(rear.translation_sigma_m))
+    assert found.rig.accepted and not found.rig.witness
+    assert [each.mount.rear for each in found.calibrations.values()] == [False, True]
+
+
+def test_a_lens_and_its_verdict_stay_together(placed):
+    found, _, kept = placed
+    for name, (_, solution, *_) in kept.items():
+        # what was judged is what is written, whatever the other cameras ask for
+        written = found.calibrations[name]
+        assert written.camera == solution.camera and written.verdict.level == 'accepted'
+        np.testing.assert_allclose(list(written.sigma.values()), solution.sigma)
+
+
+def test_every_image_is_posed_as_its_shutter_saw_it(placed):
+    _, drives, kept = placed
+    drive = drives['rear']
+    stamps = [drive.stamp_ns(index) for index in range(len(drive))]
+    stretches = kept['rear'][2]
+    assert len(stretches) == 2
+    for each in stretches:
+        structure, rows = each.scene.structure, each.scene.observed.keyframes
+        true = np.array([drive.row_poses(stamps.index(stamp))[0][LENS.size[1] // 2].T
+                         for stamp in each.scene.tracks.stamps_ns[rows]])
+        found, truth = (every[1:] @ every[:-1].transpose(0, 2, 1)
+                        for every in (structure.rotations[rows], true))
+        off = np.degrees(rotation_vectors(found @ truth.transpose(0, 2, 1)))
+        # bumps pitch the car while rows are exposed, at rates that no two poses tell
+        assert len(rows) > 25 and np.sqrt(np.mean(off**2, axis=0)).max() < 0.007
+
+
+def test_a_rig_is_written_for_all_who_take_it(placed, tmp_path):
+    found, _, _ = placed
+    write_rig(found, tmp_path)
+    assert {each.name for each in tmp_path.iterdir()} == {
+        'rig.json', 'report.html', 'front', 'rear', *RIG_FORMATS}
+    read = load_rig(tmp_path)
+    assert read == found.rig and read.accepted
+    for name, camera in read.cameras.items():
+        given = load_camera(tmp_path / camera.calibration)
+        assert given.camera == found.calibrations[name].camera and given.verdict == 'accepted'
+    # written again, without what it cannot have any more
+    refused = {name: replace(each, camera=None, sigma=None, covariance=None, sigma_px=None,
+                             verdict=Verdict('refused', ('no turns',)))
+               for name, each in found.calibrations.items()}
+    write_rig(replace(found, calibrations=refused), tmp_path)
+    assert not (tmp_path / 'camchain.yaml').exists() and (tmp_path / 'rig.urdf').exists()
