@@ -40,6 +40,7 @@ def kernels(tmp_path, monkeypatch):
         os.environ.get('PYTHONPATH')])]))
 
 
+@pytest.mark.thorough
 def test_the_notebook_runs(kernels, tmp_path):
     notebook = nbformat.read(NOTEBOOK, as_version=4)
     nbclient.NotebookClient(notebook, timeout=600, kernel_name='python3',

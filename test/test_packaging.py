@@ -106,6 +106,7 @@ def test_the_index_would_take_both(unpacked, wheel):
     assert done.stdout.count('PASSED') == 2
 
 
+@pytest.mark.thorough
 def test_the_wheel_works_in_an_empty_environment(wheel, tmp_path):
     """Installed with nothing but its dependencies it reads pictures and writes its results."""
     bin_folder = tmp_path / 'venv' / 'bin'

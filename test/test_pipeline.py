@@ -186,6 +186,7 @@ def test_two_threads_and_a_child_that_is_killed_change_nothing(frames, result):
     assert killed and same(result, again)
 
 
+@pytest.mark.thorough
 def test_a_live_calibrator_gives_the_same_even_if_asked_on_the_way_with_a_turn_lost(
         frames, result):
     stages: dict[str, float] = {}
@@ -244,6 +245,7 @@ sys.stdout.buffer.write(pickle.dumps(result))
 """
 
 
+@pytest.mark.thorough
 def test_inline_and_in_child_processes_it_is_the_same(frames, result):
     # a process of its own: numpy reads these when it is loaded
     environment = {**os.environ, **dict.fromkeys(THREAD_VARIABLES, '1')}
@@ -254,6 +256,7 @@ def test_inline_and_in_child_processes_it_is_the_same(frames, result):
     assert result.reprojection_error_px == inline.reprojection_error_px
 
 
+@pytest.mark.thorough
 def test_the_stages_by_hand_give_what_the_calibrator_gives(frames, result):
     detection, valid = Detection(QUICK), {}
     for frame in frames:
@@ -366,6 +369,7 @@ def garbage(center: int = 0) -> Scene:
     return replace(scene, tracks=replace(scene.tracks, xy=xy))
 
 
+@pytest.mark.thorough
 def test_two_short_drives_add_up(drive, frames, tmp_path):
     folder = tmp_path / 'turns'
     config = QUICK.replace({'turns.store': str(folder)})
@@ -407,6 +411,7 @@ def test_turns_of_two_cameras_are_not_stored(frames, tmp_path, monkeypatch):
     assert 'two cameras' in found.verdict.reasons[0] and not list(tmp_path.iterdir())
 
 
+@pytest.mark.thorough
 def test_a_turn_that_is_played_in_a_loop_counts_once(drive, frames):
     around = [frame.image for frame in frames[drive.turn_centers[0] - 21:
                                               drive.turn_centers[0] + 21]]
@@ -424,6 +429,7 @@ def test_a_turn_that_is_played_in_a_loop_counts_once(drive, frames):
     assert any('shows the same pictures as the turn at frame' in text for text in reasons)
 
 
+@pytest.mark.thorough
 def test_a_stored_turn_of_another_camera_is_told_and_stays(drive, frames, tmp_path):
     config = QUICK.replace({'turns.store': str(tmp_path)})
     lens = Radial((640, 360), 460.0, 460.0, 319.5, 179.5, -0.1)
@@ -524,6 +530,7 @@ def test_a_car_that_stands_while_pictures_move_is_refused(on):
     assert found.verdict.level == 'refused' and found.camera is None
 
 
+@pytest.mark.thorough
 def test_a_drive_backwards_shows_the_same_lens(frames, result):
     with limited(Calibrator(QUICK)) as calibrator:
         for frame, back in zip(frames, frames[::-1], strict=True):
@@ -662,6 +669,7 @@ def test_a_clock_that_is_set_back_at_once_is_no_wrong_unit():
             calibrator.push(Frame(n, 10**18 * (n < 3) + n * 100_000_000, image))
 
 
+@pytest.mark.thorough
 def test_a_drive_in_two_files_gives_what_the_whole_gives(drive, frames, result):
     """No turn is driven where the drive is cut, but both lose images of their straights there.
 

@@ -53,6 +53,7 @@ def test_command_and_python_give_the_same_numbers(folder, command, tmp_path):
     assert python == command
 
 
+@pytest.mark.thorough
 def test_check_of_the_command_and_of_python_say_the_same(folder, command, capsys):
     out = folder / 'out' / 'result.json'
     main(['check', str(out), str(folder / 'drive'), '--fps', str(SPEC.rate), '--quiet', '--json',
@@ -63,6 +64,7 @@ def test_check_of_the_command_and_of_python_say_the_same(folder, command, capsys
     assert (found.answer, list(found.reasons)) == (said['answer'], said['reasons'])
 
 
+@pytest.mark.thorough
 def test_a_part_of_the_pictures_is_a_camera_of_its_own(folder, command, tmp_path, capsys):
     """Two cameras side by side, of which the left one is calibrated."""
     (tmp_path / 'both').mkdir()

@@ -111,6 +111,7 @@ def test_the_same_input_and_seed_give_the_same_result(demo, calibrated):
         assert first[key] == second[key], key
 
 
+@pytest.mark.thorough
 def test_turns_lists_those_that_a_run_would_use(bag, calibrated):
     done = dashcalib('turns', bag, '--json')
     assert done.returncode == 0, done.stderr

@@ -109,6 +109,7 @@ def rows_of(path):
     return parquet.read_table(path).to_pylist()
 
 
+@pytest.mark.thorough
 def test_the_tables_tell_everything(reference):
     out, (found, _) = reference
     cameras = {row['camera']: row for row in rows_of(out / 'cameras.parquet')}

@@ -118,6 +118,7 @@ GENTLE = {f's{n}.mp4': clip_of(yaws=((-1)**n * (9.0 + n / 2),), world=80 + n, pr
                                tracks=140, keyframes=12) for n in range(8)}
 
 
+@pytest.mark.thorough
 def test_clips_without_a_turn_add_up_by_the_rules_of_a_drive():
     unknown = fuse('cam', '', GENTLE, CONFIG)
     assert unknown.calibration.verdict.level == 'weak'
@@ -131,6 +132,7 @@ def test_clips_without_a_turn_add_up_by_the_rules_of_a_drive():
     assert found.sigma['fx'] < unknown.estimate.sigma['fx']
 
 
+@pytest.mark.thorough
 def test_no_stretch_takes_the_place_of_a_turn():
     both = {**CLIPS, **dict(list(GENTLE.items())[:2])}
     enough = CONFIG.replace({'turns.wanted': 4})

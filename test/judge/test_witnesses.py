@@ -116,6 +116,7 @@ def test_a_contradiction_makes_the_result_weak_with_both_named(drive):
         solution, gyro(drive), START_S, CALIBRATED).witnesses) == before
 
 
+@pytest.mark.thorough
 def test_sigmas_hold(drive):
     pulls, solution = [], drive[0]
     turns = [steps_of(scene, solution, 0.3, START_S) for scene in solution.scenes]

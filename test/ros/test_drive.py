@@ -219,6 +219,7 @@ def test_diagnostics_tell_an_operator_everything(driven):
     assert values['published'].startswith('fx 38')
 
 
+@pytest.mark.thorough
 def test_reset_takes_everything_back(driven):
     """The last one with this node."""
     bench = driven.bench
@@ -239,6 +240,7 @@ def test_reset_takes_everything_back(driven):
     bench.close()
 
 
+@pytest.mark.thorough
 def test_turns_outlive_the_node_and_add_up(start_node, make_bench, rendered, tmp_path):
     """Two short trips of one turn each; the calibration comes of both."""
     drive, frames = rendered

@@ -139,6 +139,7 @@ def test_more_turns_know_more(no_profile):
     assert np.abs(z_of(many)).max() < 3.5
 
 
+@pytest.mark.thorough
 def test_sigma_is_honest(no_profile):
     z = np.array([z_of(solved(scenes_of(3, seed=seed, tracks=90, keyframes=10)))[:6]
                   for seed in range(12)])
