@@ -359,7 +359,7 @@ def calibrate_rig(drives: Mapping[str, Paths | Recording], base: str | None = No
     progress: called with the name of a stage and its fraction done, 0 to 1; at last 'done', 1.0.
 
     Returns a Rig: its rig has a PlacedCamera for each name, with a verdict for each degree of
-    freedom; its calibrations are those of each camera alone. Raises InputError
+    freedom; its calibrations have what each camera says alone. Raises InputError
     for input that cannot be read, ConfigError for a bad setting, WorkerError if a child process
     cannot run.
     """

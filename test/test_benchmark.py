@@ -79,6 +79,7 @@ def test_a_benchmark_replaces_its_table_and_nothing_else(tmp_path):
         write_table('speed', 'text', ['a'], results=tmp_path)
 
 
+@pytest.mark.thorough
 def test_the_runner_keeps_what_is_done_at_a_commit(tmp_path):
     """A part that is done is not begun again; one that failed is; another commit begins anew."""
     made = tmp_path / 'repository'

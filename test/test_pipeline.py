@@ -141,6 +141,7 @@ def test_the_pictures_of_a_turn_that_waits_are_in_a_file(frames):
         assert given[frame.index].flags.writeable and not frame.image.flags.writeable
 
 
+@pytest.mark.thorough
 def test_a_turn_during_which_the_car_stood_is_none(frames, result):
     moving, phantom = result.turns
     stamps_s = np.array([frame.stamp_ns for frame in frames]) / 1e9
@@ -521,7 +522,7 @@ def standing(on: str) -> Iterator[Frame]:
         yield Frame(n, n * 10**8, np.clip(image, 0, 255).astype(np.uint8))
 
 
-@pytest.mark.parametrize('on', ['ferry', 'lift'])
+@pytest.mark.parametrize('on', ['ferry', pytest.param('lift', marks=pytest.mark.thorough)])
 def test_a_car_that_stands_while_pictures_move_is_refused(on):
     with limited(Calibrator(QUICK.replace({'known.stabiliser': 'no'}))) as calibrator:
         for frame in standing(on):

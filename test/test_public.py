@@ -277,6 +277,7 @@ def test_accepted_returns_the_same_result_or_raises_with_the_reasons():
         assert all(reason in str(error.value) for reason in other.verdict.reasons)
 
 
+@pytest.mark.thorough
 def test_a_script_of_three_lines_is_clean_for_mypy(tmp_path):
     pytest.importorskip('mypy')
     root = Path(__file__).parents[1]

@@ -12,6 +12,7 @@ from dashcalib_ros import rig_session
 from dashcalib_ros.camera.rotation import rotation_vectors
 from dashcalib_ros.cli.rig import write_rig
 from dashcalib_ros.demo import Drive, Mounting, render_to_bag, true_places
+from dashcalib_ros.errors import Notice
 from dashcalib_ros.formats import load_camera
 from dashcalib_ros.formats.rig import RIG_FORMATS, load_rig
 from dashcalib_ros.input.motion import Samples, SensorStream
@@ -96,7 +97,7 @@ def test_a_rig_is_written_for_all_who_take_it(placed, tmp_path):
         assert given.camera == found.calibrations[name].camera and given.verdict == 'accepted'
     # written again, without what it cannot have any more
     refused = {name: replace(each, camera=None, sigma=None, covariance=None, sigma_px=None,
-                             verdict=Verdict('refused', ('no turns',)))
+                             verdict=Verdict('refused', (Notice('E-NO-TURNS', 'no turns'),)))
                for name, each in found.calibrations.items()}
     write_rig(replace(found, calibrations=refused), tmp_path)
     assert not (tmp_path / 'camchain.yaml').exists() and (tmp_path / 'rig.urdf').exists()

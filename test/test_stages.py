@@ -88,6 +88,7 @@ def found(detection):
     del MODELS[OneTerm.model]
 
 
+@pytest.mark.thorough
 def test_a_model_that_registers_itself_calibrates_a_rendered_drive(found):
     assert type(found.camera) is OneTerm and list(found.sigma) == ['fx', 'fy', 'cx', 'cy', 'k1']
     assert found.verdict.level == 'accepted', found.verdict

@@ -228,6 +228,7 @@ def test_frames_are_reproducible(drive):
         noisy.frame(len(noisy))
 
 
+@pytest.mark.thorough
 def test_processes_and_seeds():
     lens = Lens.of(160, 90, 75.0, -0.1)
     spec = DriveSpec(turns=0, duration_s=1.0, lead_m=10.0, seed=1)

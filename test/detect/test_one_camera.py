@@ -125,6 +125,7 @@ def test_lost_images_late_stamps_and_black_images_are_not_doubted(pictures):
         assert detect(stream, Config()).other_camera is None
 
 
+@pytest.mark.thorough
 def test_it_ends_with_the_second_camera(pictures):
     found = Detection(Config())
     both = frames(pictures, 'AB', mirrored, 20.0)
@@ -137,6 +138,7 @@ def test_it_ends_with_the_second_camera(pictures):
     assert found.other_camera is not None
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(('rate', 'pattern'), [(20.0, 'AB'), (30.0, 'ABA'), (60.0, 'ABBAA')])
 def test_the_node_sees_what_the_command_sees(pictures, rate, pattern):
     """The node thins the images before they are decoded: one a second more is let through."""

@@ -254,6 +254,7 @@ def test_release_drops_the_frames_and_keeps_the_turn():
     assert stream.detector.bank.turns()[0].images == second.images
 
 
+@pytest.mark.thorough
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([3, 10, 50]))
 def test_turns_equal_those_found_offline(seed, capacity):

@@ -55,6 +55,7 @@ def posterior(unit, prior):
     return (unit.lens + gain @ (prior.mean - unit.lens))[0], np.sqrt((own - gain @ own)[0, 0])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize('excess', [1.0, 4.0])
 def test_errors_are_halved_and_sigmas_hold(excess):
     errors, alone, inside = [], [], []

@@ -97,6 +97,7 @@ def parts(tmp_path_factory) -> list[Path]:
             write_video(place / 'v.avi', smooth(6), fps=10)]
 
 
+@pytest.mark.thorough
 @MANY
 @given(st.lists(st.integers(0, 5), min_size=1, max_size=4),
        st.floats(0.0, 3.0), st.none() | st.floats(0.05, 3.0))

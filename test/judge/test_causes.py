@@ -105,6 +105,7 @@ def with_times(solution: Solution, late_s: float) -> Solution:
     return replace(solution, scenes=tuple(map(scene_of, solution.scenes)))
 
 
+@pytest.mark.thorough
 def test_uneven_times_that_are_taken_as_even_ones_are_named(monkeypatch):
     """With a rolling shutter they look as a stabiliser does, with a global one as nothing."""
     monkeypatch.setattr(start, 'PROBES', (1.0,))

@@ -234,6 +234,7 @@ def drives():
                                                  ((4.0, 4.0, 2.0), 8, 2.0)))]
 
 
+@pytest.mark.thorough
 @settings(max_examples=40, deadline=None)
 @given(which=st.integers(0, 3), level=st.sampled_from(['weak', 'refused']),
        scale=st.floats(1e-8, 10.0), px=st.floats(0.5, 4.0), speed=st.floats(0.0, 40.0),

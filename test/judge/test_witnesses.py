@@ -242,6 +242,7 @@ def test_gps_of_another_time_is_named_with_its_zone(drive, later_s, words):
     assert said is None and line.code == 'E-GPS-NO-SAMPLES' and words in line
 
 
+@pytest.mark.thorough
 def test_a_gyro_finds_its_place_where_the_images_have_whole_seconds(drive):
     for late_s in (-1.4, 0.0, 1.3):
         stream = dataclasses.replace(gyro(drive, late_s=late_s), doubt_s=1.5)

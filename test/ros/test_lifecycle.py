@@ -73,6 +73,7 @@ def left(node, path):
     return {each.name for each in threading.enumerate()}, children(), endpoints, free
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize('program', ['calibrator', 'checker'])
 def test_random_transitions_leave_nothing(make_node, tmp_path, program):
     node, chance = make_node(program, image_transport='video'), random.Random(0)

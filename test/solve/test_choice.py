@@ -41,6 +41,7 @@ def test_a_decentred_lens_is_written_as_one(count):
     assert (error < 3).all()
 
 
+@pytest.mark.thorough
 def test_a_radial_lens_is_written_as_one_and_its_sigma_is_neither_blind_nor_timid():
     found = [solved(scenes_of(4, seed=seed, tracks=110, keyframes=12)) for seed in range(4)]
     assert [type(each.camera) for each in found].count(Radial) >= 3
@@ -114,6 +115,7 @@ def test_a_fisheye_is_recovered_beyond_90_degrees():
     assert used.used[local[:, :, 2] < 0.2 * np.linalg.norm(local, axis=2)].any()
 
 
+@pytest.mark.thorough
 def test_turns_that_may_be_of_two_kinds_are_tried_with_both():
     scenes = wide_scenes(2)
     narrow = as_model(WIDE, Radial)

@@ -67,6 +67,7 @@ def test_two_turns_cannot_tell():
     assert solved(warming(0.02, 2)).drift is None
 
 
+@pytest.mark.thorough
 def test_a_large_drift_has_no_camera_info():
     assert 'E-FOCAL-LENGTH-DRIFTS' in judge(solved(warming(0.05)), CONFIG.verdict).codes
 
@@ -101,6 +102,7 @@ def test_a_zoom_in_and_back_changes_as_much_as_in_between():
     assert found.size == pytest.approx(0.0) and found.largest == pytest.approx(0.3)
 
 
+@pytest.mark.thorough
 def test_nothing_steps_between_turns_that_overlap():
     first, second, *others = zoomed([1.0, 1.0, 1.3, 1.15])
     tracks = second.tracks
@@ -111,6 +113,7 @@ def test_nothing_steps_between_turns_that_overlap():
     assert min(drift.ways.steps_ns) > first.tracks.stamps_ns[-1]
 
 
+@pytest.mark.thorough
 def test_a_zoom_has_a_focal_length_at_each_turn():
     zooms = [1.0, 1.05, 1.2, 1.22, 1.3]
     solution = solved(zoomed(zooms))

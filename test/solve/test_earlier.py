@@ -70,6 +70,7 @@ def test_a_lens_exchanged_since_is_left_out_or_in_sigma(own, by):
         assert judge(solution, CONFIG.verdict).level != 'accepted'
 
 
+@pytest.mark.thorough
 def test_a_camera_that_hangs_upside_down_now_is_another_one():
     """Its centre is nearly the same, and so is its lens: only the road is on the other side."""
     scenes = [on_a_road(world, yaw) for world, yaw in enumerate(YAWS[:4])]

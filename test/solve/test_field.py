@@ -97,6 +97,7 @@ def test_a_windscreen_is_found_and_the_lens_behind_it(rms_px, seed):
     assert found.rays_sigma_px < found.picture.rms
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures('no_profile')
 def test_a_windscreen_makes_no_fisheye_of_a_pinhole():
     # its four coefficients explain more of such a field than those of a pinhole do

@@ -126,6 +126,7 @@ def test_a_slow_zoom_is_named_in_noise_too():
     assert judge(solution, CONFIG.verdict).level == 'weak'
 
 
+@pytest.mark.thorough
 def test_every_other_picture_zoomed_is_named():
     def breathing(scene: Scene) -> np.ndarray:
         odd = np.arange(len(scene.tracks.frames)) % 2
@@ -146,6 +147,7 @@ def test_a_windscreen_that_bends_the_picture_is_named():
     assert 'dashcalib export --to rays' in ' '.join(verdict.cures)
 
 
+@pytest.mark.thorough
 def test_what_tracks_share_makes_sigma_larger():
     fixed = solved(scenes_of(3))
     slightly = solved(moved(scenes_of(3), lambda scene: bent(scene, 1.0)))

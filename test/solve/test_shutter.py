@@ -39,6 +39,7 @@ def test_bumps_between_the_keyframes_do_not_make_a_readout_shorter():
     assert abs(found.readout_s - 0.02) < 2.5 * found.readout_sigma_s
 
 
+@pytest.mark.thorough
 def test_the_shutter_of_a_fisheye_is_measured():
     lens = Fisheye(SIZE, 300.0, 300.6, 404.0, 221.0, 0.02, -0.008, 0.003, -0.0005)
     found = solved(scenes_of(3, lens, start=Fisheye.centred(SIZE, 1.02 * lens.fx, 0.0),

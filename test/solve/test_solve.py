@@ -131,6 +131,7 @@ def test_the_same_again_to_the_last_bit(no_profile):
     np.testing.assert_array_equal(first.covariance, second.covariance)
 
 
+@pytest.mark.thorough
 def test_more_turns_know_more(no_profile):
     few, many = (solved(scenes_of(count, tracks=110, keyframes=12)) for count in (2, 6))
     # three times the turns: 1.7 times, and less Student's t
