@@ -32,8 +32,10 @@ from dashcalib_ros.judge.mount import roll_of_path
 from dashcalib_ros.reconstruct.heading import off_axis_deg, roll_deg
 from dashcalib_ros.solve.evidence import (
     HIDDEN_DEG,
+    LARGE_FIELD,
     LEAST_GAIN,
     LEAST_KIND_GAIN,
+    SMALL_FIELD,
     FixedCameraTest,
     largest_crop,
 )
@@ -603,11 +605,16 @@ MAX_KIND_SIGMAS = 10.0
 def _other_kind(grounds: Grounds) -> Finding | None:
     """Doubt a lens that explains the turns hardly better than one of the other kind.
 
-    A fisheye must explain them far better, as a pinhole has the same number of coefficients.
+    A fisheye must explain them far better, as a pinhole has the same number of coefficients; not
+    where it leaves nothing, and the pinhole folds over even behind a windscreen.
     """
     solution, camera = grounds.solution, grounds.solution.camera
+    sound = any(each.chosen and each.field < SMALL_FIELD and not each.folds
+                for each in solution.tried)
     for each in solution.tried:
         if MODELS[each.model].family == camera.family:
+            continue
+        if sound and each.folds and each.field > LARGE_FIELD and each.loses_by > LEAST_GAIN:
             continue
         if camera.family == PINHOLE and each.loses_by > LEAST_GAIN:
             continue

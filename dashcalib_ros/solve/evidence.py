@@ -64,6 +64,11 @@ LEAST_GAIN = 30.0
 LEAST_KIND_GAIN, LEAST_KIND_PX = 0.08, 0.015
 
 
+# px RMS of 1000 px of width: a sound lens leaves 0.001 to 0.03; a windscreen 0.9 and more, another
+# kind of lens 2 to 4
+SMALL_FIELD, LARGE_FIELD = 0.1, 1.0
+
+
 # the kind of lens
 
 @dataclass(frozen=True)
@@ -74,7 +79,9 @@ class Candidate:
     robust squared errors, in units of the noise of a track; 0 for the chosen one, negative for one
     that does better, but not clearly. apart_px: how far its camera is from the chosen one over the
     picture; None where they cannot be compared. chosen: it is the one that the turns choose.
-    cost_ratio: its cost of the turns left out over that of the chosen one.
+    cost_ratio: its cost of the turns left out over that of the chosen one. field: RMS px of 1000
+    px of width that it leaves to a windscreen. folds: it folds over in the picture, as no lens
+    does.
     """
 
     model: str
@@ -82,6 +89,8 @@ class Candidate:
     apart_px: float | None = None
     chosen: bool = False
     cost_ratio: float = 1.0
+    field: float = 0.0
+    folds: bool = False
 
 
 def costs_of(now: Estimate, loss_px: float) -> list[Quadratic]:
@@ -142,7 +151,14 @@ def chosen_kind(found: Sequence[Estimate]) -> tuple[Estimate, tuple[Candidate, .
     chosen = found[best]
     return chosen, tuple(Candidate(
         each.camera.model, sums[n] - sums[best], mapping_error(each.camera, chosen.camera),
-        n == best, sums[n] / sums[best]) for n, each in enumerate(found))
+        n == best, sums[n] / sums[best], field_size(each), not each.camera.covers_picture())
+        for n, each in enumerate(found))
+
+
+def field_size(found: Estimate) -> float:
+    """Return the size of the field over the picture, RMS px of 1000 px of width."""
+    size = np.sqrt(np.mean(found.imaging.field.over(found.camera)**2))
+    return float(size * 1000 / found.camera.image_size[0])
 
 
 def _least_of_another(found: Estimate, cost: float, unit: float) -> float:

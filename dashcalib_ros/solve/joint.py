@@ -27,12 +27,14 @@ from dashcalib_ros.reconstruct.heading import roll_deg
 from dashcalib_ros.reconstruct.scene import Profile, Scene, truncated_cost
 from dashcalib_ros.solve.evidence import (
     HIDDEN_DEG,
+    LARGE_FIELD,
     SHARP_DEG,
     Candidate,
     FixedCameraTest,
     chosen_kind,
     costs_of,
     drifting,
+    field_size,
     fixed_camera_tests,
     moves,
     shift_size,
@@ -72,8 +74,6 @@ STARTS = (1.0, 0.7, 1.4, 2.0)
 NEAR = 0.5
 # with all tracks: steps after each triangulation
 LAST_STEPS = (3, 3)
-# px RMS of 1000 px of width: a field as of a windscreen, or of another kind of lens
-LARGE_FIELD = 1.0
 # more rounds of steps where the focal length changes: the first leaves 6 % of a growth by 5 %
 DRIFT_ROUNDS = 3
 # nats of evidence that earlier drives had another camera: three standard deviations
@@ -286,8 +286,7 @@ def _chosen(begun: Sequence[_Begun], config: Config
 
 def _much_is_left(found: Estimate) -> bool:
     """Return whether the field is so large that another kind of lens may make it needless."""
-    size = np.sqrt(np.mean(found.imaging.field.over(found.camera)**2))
-    return bool(size > LARGE_FIELD * found.camera.image_size[0] / 1000)
+    return field_size(found) > LARGE_FIELD
 
 
 def _with_all_tracks(found: Estimate, per_turn: Mapping[TurnId, Scene], config: Config

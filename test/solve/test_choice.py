@@ -14,6 +14,7 @@ from dashcalib_ros.camera import Brown, Fisheye, Radial
 from dashcalib_ros.camera.mapping import as_model, mapping_error
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.judge.verdict import judge
+from dashcalib_ros.problem.blocks import imaging_with
 from dashcalib_ros.reconstruct.scene import Profile, Scene, Start
 from dashcalib_ros.solve import evidence
 from dashcalib_ros.solve.evidence import Candidate, is_clear
@@ -156,7 +157,8 @@ def test_a_fisheye_must_be_better_by_what_only_a_fisheye_can_be(
         monkeypatch, pinhole, fisheye, costs, noise_px, chosen):
     seen = SimpleNamespace(tracks=SimpleNamespace(seen=np.ones((20, 100), bool)))
     kinds = [SimpleNamespace(camera=camera, inflation=1.0, loss_px=lambda: 1.0, scenes=[seen] * 3,
-                             noise=lambda loss_px: SimpleNamespace(variance=noise_px**2))
+                             noise=lambda loss_px: SimpleNamespace(variance=noise_px**2),
+                             imaging=imaging_with(camera))
              for camera in (pinhole, fisheye)]
     of_kind = dict(zip((Radial, Fisheye), costs, strict=True))
     monkeypatch.setattr(evidence, 'costs_left_out', lambda kind, loss_px: dict.fromkeys(
@@ -183,6 +185,18 @@ def test_a_fisheye_is_doubted_where_a_pinhole_far_from_it_is_nearly_as_good(
     fisheye = replace(with_camera(brown, WIDE), bounds=np.array([WIDE.params - 1,
                                                                  WIDE.params + 1]),
                       tried=(pinhole, Candidate('fisheye', 0.0, 0.0, True)))
+    assert ('E-LENS-AMBIGUOUS' in judge(fisheye, CONFIG.verdict).codes) == doubted
+
+
+@pytest.mark.parametrize(('left', 'other', 'folds', 'doubted'), [
+    (0.03, 2.5, True, False), (0.9, 4.3, True, True), (0.03, 2.5, False, True),
+    (0.03, 0.5, True, True)])
+def test_a_fisheye_is_not_doubted_for_a_pinhole_that_folds_over_even_behind_a_windscreen(
+        brown, left, other, folds, doubted):
+    pinhole = Candidate('brown', 291.0, 11.0 * brown.picture.rms, False, 1.02, other, folds)
+    fisheye = replace(with_camera(brown, WIDE), bounds=np.array([WIDE.params - 1,
+                                                                 WIDE.params + 1]),
+                      tried=(pinhole, Candidate('fisheye', 0.0, 0.0, True, 1.0, left)))
     assert ('E-LENS-AMBIGUOUS' in judge(fisheye, CONFIG.verdict).codes) == doubted
 
 
