@@ -219,7 +219,6 @@ def test_diagnostics_tell_an_operator_everything(driven):
     assert values['published'].startswith('fx 38')
 
 
-@pytest.mark.thorough
 def test_reset_takes_everything_back(driven):
     """The last one with this node."""
     bench = driven.bench
