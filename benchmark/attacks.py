@@ -115,22 +115,27 @@ def warped(image: Grey, matrix: Floats, size: tuple[int, int] | None = None) -> 
         borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
-def stabilised(limit: float, lag_s: float, pitched: bool = False, gaussian: bool = False
-               ) -> Callable[[Film, np.random.Generator], Film]:
-    """Move the crop against the car's turning, up to limit times the width.
+def swings(angle: Floats, seconds: Floats, lag_s: float, gaussian: bool = False) -> Floats:
+    """Return what a stabiliser takes out of angles (n,).
 
     lag_s: of the low pass, or sigma of a Gaussian that knows the future.
     """
+    if gaussian:
+        return np.asarray(angle - gaussian_filter1d(
+            angle, lag_s / np.median(np.diff(seconds)), mode='nearest'))
+    smooth = np.empty_like(angle)
+    smooth[0] = angle[0]
+    for k in range(1, len(angle)):
+        keep = np.exp(-(seconds[k] - seconds[k - 1]) / lag_s)
+        smooth[k] = keep * smooth[k - 1] + (1 - keep) * angle[k]
+    return angle - smooth
+
+
+def stabilised(limit: float, lag_s: float, pitched: bool = False, gaussian: bool = False
+               ) -> Callable[[Film, np.random.Generator], Film]:
+    """Move the crop against the car's turning, up to limit times the width; see swings()."""
     def lagging(angle: Floats, seconds: Floats) -> Floats:
-        if gaussian:
-            return np.asarray(angle - gaussian_filter1d(
-                angle, lag_s / np.median(np.diff(seconds)), mode='nearest'))
-        smooth = np.empty_like(angle)
-        smooth[0] = angle[0]
-        for k in range(1, len(angle)):
-            keep = np.exp(-(seconds[k] - seconds[k - 1]) / lag_s)
-            smooth[k] = keep * smooth[k - 1] + (1 - keep) * angle[k]
-        return angle - smooth
+        return swings(angle, seconds, lag_s, gaussian)
 
     def change(film: Film, rng: np.random.Generator) -> Film:
         height, width = film.frames[0].image.shape

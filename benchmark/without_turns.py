@@ -22,14 +22,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
-from attacks import Film, shifted, stepped, warped, with_pictures, zoomed
+from attacks import Film, shifted, stepped, swings, warped, with_pictures, zoomed
 from mapping import GRID
 from measure import calibrate as calibrate_frames
 from measure import isolated, keep_table, load, parser_with, save, table
 from population import closest_cameras, rays_of
 from population import drive_of as camera_and_street
-from scipy.ndimage import gaussian_filter1d
 
 from dashcalib_ros import Config, calibrate
 from dashcalib_ros.demo import Drive, Turn
@@ -72,26 +70,14 @@ def film_of(drive: Drive) -> Film:
                 np.arctan2(-ahead[:, 2], np.hypot(ahead[:, 0], ahead[:, 1])), ())
 
 
-def steadied(across: bool, down: bool, lag_s: float | None
+def steadied(across: bool, down: bool, lag_s: float = 0.5, gaussian: bool = True
              ) -> Callable[[Film, np.random.Generator], Film]:
-    """Move the crop by at most 5 % of the width against what the camera turns.
-
-    lag_s: of a low pass; None: of a Gaussian of half a second, which knows the future.
-    """
-    def shakes(angle: npt.NDArray[np.float64], seconds: npt.NDArray[np.float64]
-               ) -> npt.NDArray[np.float64]:
-        step = float(np.median(np.diff(seconds)))
-        if lag_s is None:
-            return np.asarray(angle - gaussian_filter1d(angle, 0.5 / step, mode='nearest'))
-        keep, smooth = np.exp(-step / lag_s), angle.copy()
-        for k in range(1, len(angle)):
-            smooth[k] = keep * smooth[k - 1] + (1 - keep) * angle[k]
-        return angle - smooth
-
+    """Move the crop by at most 5 % of the width against what the camera turns; see swings()."""
     def change(film: Film, rng: np.random.Generator) -> Film:
         height, width = film.frames[0].image.shape
         most = 0.05 * width
-        right, below = (np.clip(-film.truth[f] * shakes(angle, film.seconds), -most, most) * on
+        right, below = (np.clip(-film.truth[f] * swings(
+            angle, film.seconds, lag_s, gaussian), -most, most) * on
                         for f, angle, on in (('fx', film.yaw, across), ('fy', film.pitch, down)))
         return with_pictures(film, (
             warped(frame.image, np.array([[1.0, 0.0, x], [0.0, 1.0, y]]), (width, height))
@@ -101,10 +87,10 @@ def steadied(across: bool, down: bool, lag_s: float | None
 
 
 SPOILT: dict[str, Callable[[Film, np.random.Generator], Film]] = {
-    'stabilised across': steadied(True, False, None),
-    'stabilised down': steadied(False, True, None),
-    'stabilised': steadied(True, True, None),
-    'stabilised, lag 0.3 s': steadied(True, True, 0.3),
+    'stabilised across': steadied(True, False),
+    'stabilised down': steadied(False, True),
+    'stabilised': steadied(True, True),
+    'stabilised, lag 0.3 s': steadied(True, True, 0.3, gaussian=False),
     'zoom 3 %, slowly': zoomed(lambda seconds, count: np.linspace(1.0, 1.03, count)),
     'zoom 3 % after half': stepped(1.03, 0.5),
     'shifted by 2 % after half': shifted(0.02)}

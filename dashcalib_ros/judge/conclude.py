@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Mask
-from dashcalib_ros.camera import AUTO
+from dashcalib_ros.camera import AUTO, Camera
 from dashcalib_ros.config import Config, ReconstructConfig, VerdictConfig
 from dashcalib_ros.detect import Bend, Lines, bend
 from dashcalib_ros.detect.detection import Detection
@@ -186,16 +186,23 @@ def outlook(scenes: Sequence[Scene], evidence: Evidence, config: VerdictConfig) 
     return verdict_of(sorted(found, key=lambda each: each.level != 'refused'))
 
 
+def _in_input(camera: Camera, sigma: Floats, px: float, size: tuple[int, int]
+              ) -> tuple[Camera, dict[str, float]]:
+    """Return a camera of the input's pictures, and its sigmas by name. sigma: (n,), as solved."""
+    full = camera.resized(px, size)
+    return full, dict(zip(full.names(), (sigma * full.units(px)).tolist(), strict=True))
+
+
 def _with_numbers(found: CalibrationData, solution: Solution, lines: Bend | None,
                   evidence: Evidence, lost: list[Notice]) -> CalibrationData:
     """Return the calibration with what a refused one has not, in the input's pixels."""
     held_out = spared('the comparison of each turn with the others', lost, cross_validation,
                       solution) or ()
-    px, camera = solution.px, solution.camera.resized(solution.px, evidence.image_size)
+    px = solution.px
+    camera, sigma = _in_input(solution.camera, solution.sigma, px, evidence.image_size)
     units, wide = camera.units(px), camera.widened().units(px)
     return replace(
-        found, camera=camera,
-        sigma=dict(zip(camera.names(), (solution.sigma * units).tolist(), strict=True)),
+        found, camera=camera, sigma=sigma,
         covariance=solution.covariance * np.outer(units, units),
         picture_covariance=solution.wide_covariance * np.outer(wide, wide),
         reprojection_error_px=solution.reprojection_error_px * px,
@@ -230,9 +237,8 @@ def _over_time(solution: Solution, evidence: Evidence) -> tuple[CameraAt, ...]:
     for stamp_ns in sorted({int(each) for own in stamps for each in (
             own[0], (own[0] + own[-1]) // 2, own[-1])}):
         camera, sigma = solution.at(stamp_ns)
-        full, units = camera.resized(solution.px, evidence.image_size), camera.units(solution.px)
-        rows.append(CameraAt(stamp_ns / 1e9 - evidence.start_s, full.named,
-                             dict(zip(full.names(), (sigma * units).tolist(), strict=True))))
+        full, named = _in_input(camera, sigma, solution.px, evidence.image_size)
+        rows.append(CameraAt(stamp_ns / 1e9 - evidence.start_s, full.named, named))
     return tuple(rows)
 
 
@@ -253,11 +259,9 @@ def _part(part: Solution | None, whole: Solution, later: int, evidence: Evidence
         verdict = judge(part, config.verdict)
     if part is None or verdict.level == 'refused':
         return Part(from_s, to_s, verdict.level, verdict.reasons, verdict.codes, None, None, None)
-    full = part.camera.resized(part.px, evidence.image_size)
-    sigma = (part.sigma * part.camera.units(part.px)).tolist()
+    full, sigma = _in_input(part.camera, part.sigma, part.px, evidence.image_size)
     return Part(from_s, to_s, verdict.level, verdict.reasons, verdict.codes, full.model,
-                full.named, dict(zip(full.names(), sigma, strict=True)),
-                part.picture.times(part.px))
+                full.named, sigma, part.picture.times(part.px))
 
 
 # px RMS; a warning names a field that no lens model has, if it is larger

@@ -268,7 +268,7 @@ def _chosen(begun: Sequence[_Begun], config: Config
         if model.family == best.found.camera.family:
             continue
         own = [each for each in begun if each.found.camera.family == model.family]
-        if (own or config.model != AUTO or _much_is_left(best.found)
+        if (own or config.model != AUTO or field_size(best.found) > LARGE_FIELD
                 or (model.family == PINHOLE and sees_as_pinhole(best.found.camera))):
             rivals += own
             with suppress(np.linalg.LinAlgError):
@@ -282,11 +282,6 @@ def _chosen(begun: Sequence[_Begun], config: Config
     profile = next((each.profile for each in begun
                     if each.found.camera.family == found.camera.family), winner.profile)
     return replace(winner, profile=profile), tried
-
-
-def _much_is_left(found: Estimate) -> bool:
-    """Return whether the field is so large that another kind of lens may make it needless."""
-    return field_size(found) > LARGE_FIELD
 
 
 def _with_all_tracks(found: Estimate, per_turn: Mapping[TurnId, Scene], config: Config
