@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Paths of several cameras of one car, with exact truth and no pictures."""
+"""Paths of several cameras of one car, with exact truth and no pictures; and a result of three."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
@@ -8,8 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from dashcalib_ros.camera.rotation import rotation_matrices
+from dashcalib_ros.errors import Notice
 from dashcalib_ros.problem.trajectory import Trajectory
 from dashcalib_ros.rig.paths import CameraPaths, ScenePath
+from dashcalib_ros.rig.placed import PlacedCamera, RigCalibration, base_camera, not_placed
+from dashcalib_ros.rig.witness import Epipolar
 
 # s, degrees of each turn; m/s
 LENGTH_S, SPEED = 5.0, 6.0
@@ -100,3 +103,11 @@ def _follow(rotations: np.ndarray, translations: np.ndarray) -> np.ndarray:
     found[:, :3, 2] = unit
     found[:, 3:, 2] = np.cross(unit, translations)
     return found
+
+
+def front_left_rear(left: PlacedCamera, why: str) -> RigCalibration:
+    """Return a rig of which the rear camera has no place. why: in words."""
+    return RigCalibration('front', {
+        'front': base_camera('front/result.json'), 'left': left,
+        'rear': not_placed('rear/result.json', Notice('E-RIG-OTHER-DRIVE', why))},
+        {('front', 'left'): Epipolar(900, 0.3, 0.05)})

@@ -13,6 +13,7 @@ import pycolmap
 import pytest
 import yaml
 from made_calibration import EACH_MODEL, MOUNT, TRUTH, calibration_of, make_calibration
+from made_rig import front_left_rear
 from scipy.spatial.transform import Rotation
 
 from dashcalib_ros.camera.rotation import OPTICAL
@@ -21,22 +22,15 @@ from dashcalib_ros.formats import calibrators, photogrammetry
 from dashcalib_ros.formats.rig import RIG_FORMATS, load_rig, placed_cameras, rig_json
 from dashcalib_ros.rig.placed import (
     PlacedCamera,
-    RigCalibration,
     Visible,
-    base_camera,
-    not_placed,
 )
-from dashcalib_ros.rig.witness import Epipolar
 
 SURE = ('accepted', 'accepted', 'accepted')
-RIG = RigCalibration('front', {
-    'front': base_camera('front/result.json'),
-    'left': PlacedCamera('left/result.json', 'accepted', (1.0, 70.0, -2.0), (0.05, 0.06, 0.04),
-                         (0.5, 0.0, -0.2), (0.02, 1.0, 0.02), 0.03, 0.001,
-                         Visible(SURE, ('accepted', 'not visible', 'accepted'), 'accepted'),
-                         (Notice('E-RIG-TRANSLATION', 'no height'),)),
-    'rear': not_placed('rear/result.json', Notice('E-RIG-OTHER-DRIVE', 'another drive'))},
-    {('front', 'left'): Epipolar(900, 0.3, 0.05)})
+RIG = front_left_rear(PlacedCamera(
+    'left/result.json', 'accepted', (1.0, 70.0, -2.0), (0.05, 0.06, 0.04), (0.5, 0.0, -0.2),
+    (0.02, 1.0, 0.02), 0.03, 0.001,
+    Visible(SURE, ('accepted', 'not visible', 'accepted'), 'accepted'),
+    (Notice('E-RIG-TRANSLATION', 'no height'),)), 'another drive')
 
 
 def test_a_rig_is_read_back(tmp_path):

@@ -8,28 +8,21 @@ from xml.etree import ElementTree
 
 import numpy as np
 from made_calibration import MOUNT, make_calibration
+from made_rig import front_left_rear
 from page_reader import Page
 
-from dashcalib_ros.errors import Notice
 from dashcalib_ros.formats.rig import placed_cameras
 from dashcalib_ros.report.rig import rig_html
 from dashcalib_ros.rig.placed import (
     PlacedCamera,
-    RigCalibration,
     Visible,
-    base_camera,
-    not_placed,
 )
-from dashcalib_ros.rig.witness import Epipolar
 
 SURE = ('accepted', 'accepted', 'accepted')
-RIG = RigCalibration('front', {
-    'front': base_camera('front/result.json'),
-    'left': PlacedCamera('left/result.json', 'accepted', (0.0, 90.0, 0.0), (0.1, 0.1, 0.1),
-                         (-0.5, 0.0, -1.0), (0.02, 0.3, 0.04), 0.0301, 0.001,
-                         Visible(SURE, ('accepted', 'not visible', 'accepted'), 'accepted')),
-    'rear': not_placed('rear/result.json', Notice('E-RIG-OTHER-DRIVE', '<b>another drive'))},
-    {('front', 'left'): Epipolar(900, 0.3, 0.05)})
+RIG = front_left_rear(PlacedCamera(
+    'left/result.json', 'accepted', (0.0, 90.0, 0.0), (0.1, 0.1, 0.1), (-0.5, 0.0, -1.0),
+    (0.02, 0.3, 0.04), 0.0301, 0.001,
+    Visible(SURE, ('accepted', 'not visible', 'accepted'), 'accepted')), '<b>another drive')
 
 
 def page_of(rig, mount=MOUNT):
