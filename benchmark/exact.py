@@ -226,8 +226,9 @@ def main() -> None:
             if done(rows.get(key)) and not given.again:
                 continue
             outcome = isolated(measured, given.cases / f'{seed}.scenes.pkl', noise_px)
-            complain(f'{key}: {outcome.failure}' if outcome.value is None else f'{key}: ' + ', '.join(
-                f'{name} {value}' for name, value in outcome.value.items() if name != 'drifts'))
+            shown = {name: value for name, value in (outcome.value or {}).items()
+                     if name != 'drifts'}
+            complain(f'{key}: {outcome.failure or shown}')
             if outcome.value:
                 rows[key] = {**outcome.value, 'commit': commit()}
                 save(path, rows)
