@@ -8,7 +8,8 @@
 CASES/SEED.scenes.pkl are the turns that `population.py --stage scenes` has reconstructed. Each of
 their observations is put where the true lens sees the true point from where the camera was at the
 time of its row. So tracks are as many, as long and as badly spread as real ones. Lengths are px of
-the pictures that are solved. Rows go to OUT/exact.json, the table is printed.
+the pictures that are solved. What the real tracks without glass are off by also says by how far
+they drift alike (problem/normal.py). Rows go to OUT/exact.json, the table is printed.
 """
 from __future__ import annotations
 
@@ -23,6 +24,7 @@ import numpy as np
 from measure import commit, complain, done, isolated, load, parser_with, processor_s, save, table
 from population import AnyLens, Case, Floats, drive_of, load_case, off, rays_of
 from result_tables import keep_table
+from scipy.optimize import minimize_scalar
 from wide import WideDrive
 
 from dashcalib_ros import Config
@@ -30,7 +32,9 @@ from dashcalib_ros.arrays import Mask
 from dashcalib_ros.demo import Drive
 from dashcalib_ros.demo.drive import START_NS
 from dashcalib_ros.demo.vehicle import MARGIN_S
+from dashcalib_ros.problem.normal import common_drifts
 from dashcalib_ros.reconstruct.scene import Scene, retriangulated
+from dashcalib_ros.robust import mad_sigma
 from dashcalib_ros.solve import solve
 from dashcalib_ros.solve.solution import Solution
 
@@ -40,6 +44,8 @@ ASTRAY_PX = 3.0
 NEAR_M, FAR_M = 1.5, 150.0
 # of the row in which a point is seen
 ROW_STEPS = 8
+# of the fit of drifts
+ROBUST_STEPS = 15
 
 
 def exact(scene: Scene, drive: Drive, lens: AnyLens) -> Scene:
@@ -99,12 +105,51 @@ def measured(path: Path, noise_px: float) -> dict[str, Any]:
     lens: AnyLens = drive.wide_lens if isinstance(drive, WideDrive) else drive.lens
     scenes = [with_noise(exact(scene, drive, lens), noise_px, config, case.seed)
               for scene in case.scenes]
+    # those of glass are off by what the glass does
+    alike = [] if noise_px or case.glass else [
+        drifts(scene, truth) for scene, truth in zip(case.scenes, scenes, strict=True)]
     before = processor_s()
     found = solve(scenes, config)
     row = {'seed': case.seed, 'noise_px': noise_px, 'lens': case.lens['model'],
            'glass_px': case.glass.rms_px if case.glass else 0.0, 'readout_ms': case.readout_ms,
-           'cpu_s': processor_s() - before}
+           'cpu_s': processor_s() - before, 'drifts': alike}
     return row if found is None else {**row, **_off(found, case)}
+
+
+def drifts(scene: Scene, truth: Scene) -> list[tuple[list[float], list[list[float]]]]:
+    """Return the common drifts of a turn's tracks by axis, px, each with its covariance.
+
+    Robustly fitted to what they are off by, each track being one measurement.
+    """
+    both = replace(scene.structure, used=scene.structure.used & truth.tracks.seen)
+    observed = replace(scene, structure=both).observed
+    off = observed.xy - truth.tracks.xy[observed.rows, observed.columns]
+    columns, found = common_drifts(observed).T, []
+    for left in off.T:
+        weight, values = np.ones(len(left)), np.zeros(columns.shape[1])
+        for _ in range(ROBUST_STEPS):
+            weighted = columns * weight[:, None]
+            values = np.linalg.solve(weighted.T @ columns, weighted.T @ left)
+            residual = left - columns @ values
+            weight = 1 / (1 + (residual / (2 * mad_sigma(residual)))**2)
+        by_track = np.zeros((len(observed.tracks), columns.shape[1]))
+        np.add.at(by_track, observed.point, columns * (weight * residual)[:, None])
+        inverse = np.linalg.inv((columns * weight[:, None]).T @ columns)
+        spread = inverse @ (by_track.T @ by_track) @ inverse
+        found.append((values.tolist(), spread.tolist()))
+    return found
+
+
+def size_of(all_drifts: Sequence[tuple[list[float], list[list[float]]]]) -> float:
+    """Return the standard deviation of drifts that explains them best, px."""
+    def cost(log_size: float) -> float:
+        total = 0.0
+        for values, spread in all_drifts:
+            variance = np.asarray(spread) + np.exp(2 * log_size) * np.eye(len(values))
+            total += np.linalg.slogdet(variance)[1] + values @ np.linalg.solve(variance, values)
+        return float(total)
+
+    return float(np.exp(minimize_scalar(cost, bounds=(-9.0, 0.0), method='bounded').x))
 
 
 def _off(found: Solution, case: Case) -> dict[str, Any]:
@@ -139,7 +184,12 @@ def summary(rows: Sequence[dict[str, Any]]) -> str:
             else [f'{row["noise_px"]:g}', str(row['seed']), 'no solution', *['']*4]
             for row in sorted(rows, key=lambda row: (row['noise_px'], row['seed']))]
     head = ['rays off, px', 'over sigma', 'camera alone off, px', 'wrong kind']
+    drifting = [row for row in rows if row.get('drifts')]
+    sizes = [size_of([turn[axis] for row in drifting for turn in row['drifts']])
+             for axis in (0, 1)] if drifting else []
     return '\n\n'.join([
+        *(f'Real tracks of {len(drifting)} cameras without glass drift alike by {along:.3f} px '
+          f'along x and {down:.3f} px along y.' for along, down in ([sizes] if drifting else [])),
         table(['noise, px', 'cameras', 'of them', *head, 'readout off, ms'], lines),
         table(['noise, px', 'camera', 'found', *head[:-1], 'readout, ms'],
               [line[:6] + line[7:] if len(line) == 8 else line for line in each])])
@@ -176,7 +226,9 @@ def main() -> None:
             if done(rows.get(key)) and not given.again:
                 continue
             outcome = isolated(measured, given.cases / f'{seed}.scenes.pkl', noise_px)
-            complain(f'{key}: {outcome.failure or outcome.value}')
+            shown = {name: value for name, value in (outcome.value or {}).items()
+                     if name != 'drifts'}
+            complain(f'{key}: {outcome.failure or shown}')
             if outcome.value:
                 rows[key] = {**outcome.value, 'commit': commit()}
                 save(path, rows)

@@ -17,7 +17,7 @@ import numpy as np
 from dashcalib_ros.arrays import Floats, Ints
 from dashcalib_ros.camera.rotation import crossed, rotation_matrices
 from dashcalib_ros.problem.blocks import ImageBlock, Imaging, Seen
-from dashcalib_ros.problem.observations import Stretch
+from dashcalib_ros.problem.observations import Observed, Stretch
 from dashcalib_ros.problem.quadratic import Quadratic
 
 # parameters of a point, of a pose: a small rotation in the camera's axes, then a move, and of how
@@ -27,6 +27,10 @@ POINT, POSE, MOTION = 3, 6, 6
 LEAST_VARIANCE = 1e-6
 # of damped steps: the least and the greatest diagonal, as Ceres has them
 LEAST, GREATEST = 1e-6, 1e32
+# of the noise: by how far all tracks drift alike from their first image to their last, for each
+# of the smooth patterns over the picture. Of 15 rendered drives: 0.015 px where the noise
+# is 0.054 px (benchmark/results/exact.md)
+COMMON_DRIFT = 0.28
 
 
 @dataclass(frozen=True)
@@ -219,14 +223,16 @@ def moved_by(stretch: Stretch, follow: Follow, part: float = 1.0) -> Stretch:
 
 
 def normal_equations(linear: Linear, variance: float = 1.0, kept: Sequence[str] = (),
-                     tracks: bool = False, images: bool = False, radius: float = np.inf) -> Normal:
+                     tracks: bool = False, images: bool = False, drift_px: float = 0.0,
+                     radius: float = np.inf) -> Normal:
     """Return the normal equations of a stretch.
 
     variance: of a residual, px^2, against which the priors of images' blocks count. kept: blocks
     of images that are not eliminated, and have no prior. tracks: with by_track, each track being
     one measurement; images: what observations of an image share is in it, too, which holds at the
-    optimum only: elsewhere all of them ask for the same change. radius: how far the linearisation
-    is trusted; inf: it is not damped.
+    optimum only: elsewhere all of them ask for the same change. drift_px: by how much tracks drift
+    alike, see common_drifts(). radius: how far the linearisation is trusted; inf: it is not
+    damped.
     """
     own, extras = linear.own, linear.extras
     whole, inverse = (linear.without_points if radius == np.inf
@@ -247,7 +253,7 @@ def normal_equations(linear: Linear, variance: float = 1.0, kept: Sequence[str] 
         places[name] = slice(at, at := at + len(extras[name]))
     by_track = np.zeros((size, size))
     if tracks or images:
-        by_track = _by_track(linear, inverse, solved[:, :-1], first, rest, images)
+        by_track = _by_track(linear, inverse, solved[:, :-1], first, rest, images, drift_px)
     return Normal(linear, Quadratic(left[:, :-1], left[:, -1], by_track), places, inverse,
                   solved[:, :-1], solved[:, -1], gone,
                   float(right[:, -1] @ solved[:, -1] - whole[-1, -1]))
@@ -358,7 +364,7 @@ def _pose_solution(inner: Floats, right: Floats, stretch: Stretch) -> Floats:
 
 
 def _by_track(linear: Linear, inverse: Floats, response: Floats, first: Ints, rest: Ints,
-              images: bool) -> Floats:
+              images: bool, drift_px: float) -> Floats:
     """Return (m, m) the covariance of the score, all else following.
 
     response: (e, m) of the parameters first (e,); rest: (m + 1,) the parameters, and the residual.
@@ -373,23 +379,38 @@ def _by_track(linear: Linear, inverse: Floats, response: Floats, first: Ints, re
     if linear.follow is not None:
         motion = linear.extras['motion']
         follow[motion] += linear.follow @ follow[linear.extras['pose']]
-    each = linear.wide[0, :-1] * linear.wide[0, -1] + linear.wide[1, :-1] * linear.wide[1, -1]
-    scores = np.empty((each.shape[1], size))
-    for k, some in enumerate(observed.images):
-        scores[some] = each[POINT:POINT + own, some].T @ follow[own * k:own * (k + 1)]
-    scores[:, len(kept):] += each[POINT + own:].T
-    by_track = np.empty((len(inverse), size))
+    # how each point follows
+    points = []
     for chunk, mixed in zip(observed.chunks, linear.mixed, strict=True):
         span = own * (chunk.end - chunk.begin)
-        points = mixed[:, :span].transpose(0, 2, 1) @ follow[own * chunk.begin:own * chunk.end]
-        points[:, :, len(kept):] += mixed[:, span:-1].transpose(0, 2, 1)
-        points = np.einsum('cij,jcm->icm', inverse[chunk.points], points)
-        theirs = scores[chunk.observations]
-        for own_point, point in zip(each[:POINT, chunk.observations], points, strict=True):
-            theirs -= own_point[:, None] * point[chunk.place]
-        scores[chunk.observations] = theirs
-        by_track[chunk.points] = np.add.reduceat(theirs, chunk.starts, axis=0)
+        part = mixed[:, :span].transpose(0, 2, 1) @ follow[own * chunk.begin:own * chunk.end]
+        part[:, :, len(kept):] += mixed[:, span:-1].transpose(0, 2, 1)
+        points.append(np.einsum('cij,jcm->icm', inverse[chunk.points], part))
+
+    def scores_of(residuals: Floats) -> Floats:
+        """Return (n, m) the score that each observation has by such residuals (2, n)."""
+        each = linear.wide[0, :-1] * residuals[0] + linear.wide[1, :-1] * residuals[1]
+        found = np.empty((each.shape[1], size))
+        for k, some in enumerate(observed.images):
+            found[some] = each[POINT:POINT + own, some].T @ follow[own * k:own * (k + 1)]
+        found[:, len(kept):] += each[POINT + own:].T
+        for chunk, part in zip(observed.chunks, points, strict=True):
+            theirs = found[chunk.observations]
+            for own_point, point in zip(each[:POINT, chunk.observations], part, strict=True):
+                theirs -= own_point[:, None] * point[chunk.place]
+            found[chunk.observations] = theirs
+        return found
+
+    scores = scores_of(linear.wide[:, -1])
+    by_track = np.empty((len(inverse), size))
+    for chunk in observed.chunks:
+        by_track[chunk.points] = np.add.reduceat(scores[chunk.observations], chunk.starts, axis=0)
     spread = by_track.T @ by_track
+    if drift_px:
+        drifts = drift_px * common_drifts(observed)
+        for axis in np.eye(2):
+            asked = drifts @ scores_of(axis[:, None] * np.ones(drifts.shape[1]))
+            spread = spread + asked.T @ asked
     if images:
         # a shutter's rows while the car shakes, or blur, move all that an image sees
         starts = [some.start for some in observed.images]
@@ -397,6 +418,24 @@ def _by_track(linear: Linear, inverse: Floats, response: Floats, first: Ints, re
         values, vectors = np.linalg.eigh(sums.T @ sums - scores.T @ scores)
         spread = spread + (vectors * np.maximum(values, 0.0)) @ vectors.T
     return np.asarray(spread)
+
+
+def common_drifts(observed: Observed) -> Floats:
+    """Return (6, n) how far observations are off where all tracks drift alike, in units of it.
+
+    Each track drifts by one from its first observation to its last, times a polynomial of the
+    second degree over the picture. What a corner looks like decides where it drifts, and all of a
+    street look alike. Thousands of tracks do not average that out, and the height of the centre
+    hangs on it: cy was 4.7 sigma off without (docs/lessons.md).
+    """
+    seconds = observed.stamps_ns / 1e9
+    begin, end = np.full((2, len(observed.tracks)), [[np.inf], [-np.inf]])
+    np.minimum.at(begin, observed.point, seconds)
+    np.maximum.at(end, observed.point, seconds)
+    middle, span = (begin + end) / 2, np.maximum(end - begin, 1e-9)
+    age = (seconds - middle[observed.point]) / span[observed.point]
+    x, y = (2 * observed.xy.T - np.array(observed.image_size)[:, None]) / observed.image_size[0]
+    return np.asarray(age * np.stack([np.ones_like(x), x, y, x * x, x * y, y * y]))
 
 
 def weights(residual: Floats, loss_px: float) -> Floats:

@@ -24,7 +24,7 @@ from dashcalib_ros.camera import MODELS
 from dashcalib_ros.camera.mapping import mapping_error
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.problem.blocks import Bend, Block, Drift, ImageBlock, Shift, Zoom
-from dashcalib_ros.problem.normal import Normal, normal_equations
+from dashcalib_ros.problem.normal import COMMON_DRIFT, Normal, normal_equations
 from dashcalib_ros.problem.quadratic import Quadratic
 from dashcalib_ros.reconstruct.scene import errors_px
 from dashcalib_ros.solve.optimise import (
@@ -96,7 +96,8 @@ class Candidate:
 def costs_of(now: Estimate, loss_px: float) -> list[Quadratic]:
     """Return each turn's cost about what turns share, at the noise; images' shifts follow."""
     unit = now.noise(loss_px).variance * now.inflation
-    return [cost.at_noise(unit) for cost in costs_by_track(now.linear(loss_px), unit)]
+    return [cost.at_noise(unit) for cost in costs_by_track(
+        now.linear(loss_px), unit, COMMON_DRIFT * float(np.sqrt(unit)))]
 
 
 def costs_left_out(now: Estimate, loss_px: float) -> dict[TurnId, float]:

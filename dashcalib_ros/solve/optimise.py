@@ -149,13 +149,15 @@ def _with_sizes_chosen(now: Estimate, linear: Sequence[Linear], loss_px: float) 
         total, imaging, [square, loose], NOT_SQUARE_NATS)), inflation)
 
 
-def costs_by_track(linear: Sequence[Linear], unit: float) -> list[Quadratic]:
+def costs_by_track(linear: Sequence[Linear], unit: float, drift_px: float = 0.0
+                   ) -> list[Quadratic]:
     """Return the cost of each stretch, each track being one measurement.
 
-    What observations of one image share counts, too, where its picture is not shifted.
+    What observations of one image share counts, too, where its picture is not shifted. drift_px:
+    by how much all tracks drift alike.
     """
     return [normal_equations(each, unit, tracks=True, images=all(
-        block.turns for block in each.imaging.of_each_image(each.stretch))).cost
+        block.turns for block in each.imaging.of_each_image(each.stretch)), drift_px=drift_px).cost
         for each in linear]
 
 

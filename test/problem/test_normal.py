@@ -232,6 +232,29 @@ def test_points_and_poses_follow_the_camera(readout_s):
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
 
 
+def test_drifts_that_tracks_have_in_common_are_in_the_covariance_of_the_score():
+    scene = as_seen(small_scene(LENS), imaging := Imaging.of(Lens(LENS)))
+    seen, loss_px, drift_px = imaging.seen(scene), 1e4, 0.01
+    linear, observed = linearised(seen, loss_px), seen.observed
+    expected = normal_equations(linear, tracks=True).cost.by_track
+    ages = np.zeros(len(observed.rows))
+    for track in range(len(observed.tracks)):
+        mine = observed.point == track
+        seconds = observed.stamps_ns[mine] / 1e9
+        ages[mine] = (seconds - (seconds[0] + seconds[-1]) / 2) / (seconds[-1] - seconds[0])
+    x, y = 2 * observed.xy.T / SIZE[0] - np.array([[1.0], [SIZE[1] / SIZE[0]]])
+    for pattern in (x**0, x, y, x**2, x * y, y**2):
+        for axis in (0, 1):
+            xy = scene.tracks.xy.copy()
+            xy[observed.rows, observed.columns, axis] += drift_px * ages * pattern
+            drifted = replace(scene, tracks=replace(scene.tracks, xy=xy))
+            asked = (normal_of(drifted, imaging, loss_px).cost.score
+                     - normal_equations(linear).cost.score)
+            expected = expected + np.outer(asked, asked)
+    found = normal_equations(linear, tracks=True, drift_px=drift_px).cost.by_track
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
+
+
 def test_a_lens_that_sees_none_of_some_points_counts_them_for_nothing():
     [scene] = scenes_of(1, start=LENS)
     points = scene.structure.points.copy()
