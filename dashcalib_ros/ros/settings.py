@@ -120,6 +120,9 @@ class NodeConfig:
         False, 'subscribe odom (nav_msgs/Odometry), whose speed gives the height of the camera')
     use_fix: bool = setting(
         False, 'subscribe fix (sensor_msgs/NavSatFix), independent evidence for fx')
+    use_temperature: bool = setting(
+        False, 'subscribe temperature (sensor_msgs/Temperature of the camera), which the focal '
+               'length may follow')
     imu_topic: str = expert('', 'deprecated: set use_imu, and remap imu with -r imu:=TOPIC')
     odom_topic: str = expert('', 'deprecated: set use_odom, and remap odom with -r odom:=TOPIC')
     fix_topic: str = expert('', 'deprecated: set use_fix, and remap fix with -r fix:=TOPIC')

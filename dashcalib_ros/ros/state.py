@@ -55,7 +55,9 @@ def judge(new: CalibrationData, complete: bool, published: NamedCamera | None, c
         return Judgement(action, '; '.join(new.verdict.told), contradictions)
     if published is None:
         return Judgement('adopt')
-    against = contradicted(published.camera, published.sigma, new.camera, new.sigma)
+    before_now = (published.camera if new.temperature_c is None
+                  else published.at_temperature(new.temperature_c))
+    against = contradicted(before_now, published.sigma, new.camera, new.sigma)
     if against:
         return _contradicted(f'the published one: {", ".join(against)}; check whether the camera '
                              f'was moved or its lens changed', contradictions, limits,
