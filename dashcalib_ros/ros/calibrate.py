@@ -166,12 +166,15 @@ class Calibrating:
         # by request, or with other stored turns: count once
         again = self._trusted() is not None and bool(turns) and turns <= self._counted
         judged = Judgement('keep') if again else judge(
-            calibration, result.complete, self._trusted(), self._contradictions, self._own)
+            calibration, result.complete, self._trusted(), self._contradictions, self._own,
+            self._kept.days if self._kept else 0.0)
         match judged.action:
-            case 'adopt' | 'replace':
+            case 'adopt' | 'follow' | 'replace':
                 if judged.action == 'replace':
                     self._log.warning(f'the calibration is replaced: {judged.why}')
-                self._adopt(calibration)
+                elif judged.action == 'follow':
+                    self._log.info(f'the calibration follows the newest turns: {judged.why}')
+                self._adopt(judged.calibration or calibration)
                 self.drive.learner.restart()
             case 'give_up':
                 self._log.error(f'the published calibration is withdrawn: {judged.why}')
