@@ -339,7 +339,8 @@ def calibrate(path: Paths, fps: float | None = None, config: Settings = None,
               topic: str | None = None, start_s: float = 0.0,
               duration_s: float | None = None, mask: MaskOrPath = None,
               progress: Progress | None = None, motion: MotionOrPath = None,
-              model: str | None = None, crop: Part | None = None) -> Calibration:
+              model: str | None = None, crop: Part | None = None,
+              temperature: str | None = None) -> Calibration:
     """Calibrate a recorded drive.
 
     path: a ROS 2 bag (folder, .mcap, .db3), a ROS 1 .bag, a video, a folder of images, or several
@@ -357,13 +358,16 @@ def calibrate(path: Paths, fps: float | None = None, config: Settings = None,
     model: the lens model, over that of config: radial, brown, fisheye, or auto.
     crop: (x, y, width, height) of the part of the pictures that is used, px, as one of two cameras
     side by side; the mask is of that part, and so is the camera.
+    temperature: of the camera, which its focal length may follow: the path of a CSV (stamp_s and
+    temperature, in degrees Celsius), or a topic of the bag.
 
     Returns a Calibration: its verdict.level is 'accepted', 'weak' or 'refused', and its camera is
     None if it is refused; accepted() returns it, or raises. Raises InputError for input that
     cannot be read, ConfigError for a bad setting, WorkerError if a child process cannot run.
     """
     settings = settings_of(config, model)
-    drive = open_drive(path, topic, fps, start_s, duration_s, mask, motion, crop=crop)
+    drive = open_drive(path, topic, fps, start_s, duration_s, mask, motion, crop=crop,
+                       temperature=temperature)
     with Calls(progress) as observer:
         return calibrate_drive(drive, settings, observer)
 

@@ -375,7 +375,7 @@ def drifting(found: Estimate, temperature: Samples | None = None) -> Drift | Non
     alone = [likeliest_of(replace(one, steps_ns=()), own[:1])]
     if warmth is not None:
         warm = likeliest_of(replace(one, steady=False, warmth=warmth, steps_ns=()), own[1:2])
-        follows = alone[0][0] <= warm[0] + DRIFT_NATS
+        follows = warm[0] > max(DRIFT_NATS, alone[0][0] - DRIFT_NATS)
         alone, kept = ([warm], own[1:]) if follows else (alone, np.delete(own, 1))
         asked = replace(asked, value=np.zeros(len(kept)), steady=not follows,
                         warmth=warmth if follows else None)
