@@ -21,6 +21,7 @@ from synthetic import SIZE, synthetic_turn
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera, Radial
 from dashcalib_ros.config import Config
+from dashcalib_ros.input.motion import Samples
 from dashcalib_ros.judge.verdict import judge
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve import solve
@@ -68,6 +69,18 @@ def stepping(size: float, before: int) -> Zoom:
     return lambda stamps_s: np.where(stamps_s < before * APART_S - 1, 1.0, 1 + size)
 
 
+def following(size: float, seed: int) -> Case:
+    """Return a drive that follows a temperature, by size of 1 per kelvin. It wanders by 10 K."""
+    rng = np.random.default_rng([seed, 7])
+    stamps_s = np.arange(0.0, len(YAWS) * APART_S, 10.0)
+    degrees = 30 + rng.normal(0, 5) + 10 * np.sin(
+        2 * np.pi * (stamps_s / rng.uniform(240, 600) + rng.uniform()))
+    warmth = Samples(stamps_s, degrees[:, None])
+    return Case(f'{100 * size:g} % per kelvin',
+                lambda at_s: 1 + size * (warmth.at(at_s)[:, 0] - degrees.mean()), warmth=warmth,
+                per_kelvin=size)
+
+
 def zooming(stamps_s: Floats) -> Floats:
     """Return a zoom by 1.5 within a minute, which begins and ends gently."""
     return np.asarray(1 + 0.5 * np.clip(stamps_s / 60, 0, 1)**1.3)
@@ -75,12 +88,17 @@ def zooming(stamps_s: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Case:
-    """A way of changing. before: the turn before which it steps."""
+    """A way of changing. before: the turn before which it steps.
+
+    warmth: the temperature, with which it grows by so much of 1 per kelvin.
+    """
 
     name: str
     zoom: Zoom
     apart_s: float = APART_S
     before: int | None = None
+    warmth: Samples | None = None
+    per_kelvin: float = 0.0
 
 
 def cases(seed: int) -> list[Case]:
@@ -88,7 +106,8 @@ def cases(seed: int) -> list[Case]:
     before = 1 + seed % (len(YAWS) - 1)
     return [*(Case(f'grows by {size:g} %', growing(size / 100)) for size in (0, 0.2, 0.5, 1)),
             *(Case(f'steps by {size:g} %', stepping(size / 100, before), before=before)
-              for size in (1, 2, 5)), Case('zooms by 1.5', zooming, 15.0)]
+              for size in (1, 2, 5)), Case('zooms by 1.5', zooming, 15.0),
+            *(following(size / 100, seed) for size in (0, 0.02, 0.05, 0.1))]
 
 
 def row_of(case: Case, camera: Camera, solution: Solution) -> dict[str, Any]:
@@ -105,7 +124,14 @@ def row_of(case: Case, camera: Camera, solution: Solution) -> dict[str, Any]:
     row = {'named': drift is not None,
            'weak': judge(solution, Config().verdict).level != 'accepted',
            'within': np.mean([right(*solution.at(when), when) for when in middles])}
-    if drift is not None:
+    of_kelvin = None if drift is None else drift.of_kelvin
+    if case.warmth is not None and drift is not None:
+        if of_kelvin is not None:
+            assert drift.ways.warmth is not None
+            zoomed = 1 + case.per_kelvin * (drift.ways.warmth.mean_c - case.warmth.values.mean())
+            row |= {'z': (of_kelvin[0] - case.per_kelvin / zoomed) / of_kelvin[1],
+                    'sigma': 100 * of_kelvin[1]}
+    elif drift is not None:
         row |= {'z': (drift.size - 2 * (last - first) / (last + first)) / drift.sigma,
                 'sigma': 100 * drift.sigma}
     if case.before is not None:
@@ -145,7 +171,8 @@ def main() -> None:
         for case in cases(seed):
             key = f'{case.name}, camera {seed}'
             if key not in known or args.again:
-                solution = solve(drive(camera, case.zoom, seed, case.apart_s), Config())
+                solution = solve(drive(camera, case.zoom, seed, case.apart_s), Config(),
+                                 case.warmth)
                 known[key] = {'commit': at, **(
                     {} if solution is None else row_of(case, camera, solution))}
                 save(path, known)

@@ -18,7 +18,7 @@ from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import InputError, Notice, spared
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.decode import mask_of
-from dashcalib_ros.input.motion import SensorStream
+from dashcalib_ros.input.motion import Samples, SensorStream
 from dashcalib_ros.input.poses import Poses
 from dashcalib_ros.input.source import size_text
 from dashcalib_ros.judge import CalibrationData, Check, Monitor, Odometry, Reading, Verdict
@@ -132,6 +132,7 @@ class Calibrator:
         self.solution: Solution | None = None
         self._live = live
         self._motion: SensorStream | None = None
+        self._warmth: SensorStream | None = None
         # what the calibration under way has to do without
         self._lost: list[Notice] = []
         self._detect_s = 0.0
@@ -173,12 +174,13 @@ class Calibrator:
         self.scenes.make_room()
         return self.status()
 
-    def sense(self, motion: SensorStream) -> None:
+    def sense(self, motion: SensorStream, warmth: SensorStream | None = None) -> None:
         """Take what the car's sensors say of the drive so far, in the place of what came before.
 
-        The next calibrate() uses it; its stamps count from the first image.
+        The next calibrate() uses it; its stamps count from the first image. warmth: with the
+        temperature, where that is not in motion.
         """
-        self._motion = motion
+        self._motion, self._warmth = motion, warmth
 
     def calibrate(self, progress: Progress | None = None, final: bool = True) -> Calibration:
         """Adjust the best turns' scenes together and judge the result.
@@ -234,7 +236,8 @@ class Calibrator:
                 continue
             # the search for repeated pictures takes a second and hardly ever finds some
             search = self.workers.begin(without_repeated, scenes)
-            solving = self.workers.begin(solve, scenes, config, reports=True)
+            warm = spared('the temperature', self._lost, self._temperature)
+            solving = self.workers.begin(solve, scenes, config, warm, reports=True)
             kept, repeated = self.workers.result(search)
             if repeated:
                 self.workers.drop(solving)
@@ -243,9 +246,16 @@ class Calibrator:
             if any(len(one.tracks.frames) < len(other.tracks.frames)
                    for one, other in zip(kept, scenes, strict=True)):
                 self.workers.drop(solving)
-                solving = self.workers.begin(solve, kept, config, reports=True)
+                solving = self.workers.begin(solve, kept, config, warm, reports=True)
             return kept, self.workers.result(solving, progress)
         return [], None
+
+    def _temperature(self) -> Samples | None:
+        """Return the temperature on the images' clock; None where nobody measured it."""
+        start_s = self.detection.start_s
+        found = [samples for stream in (self._warmth, self._motion) if stream is not None
+                 and (samples := stream.since(start_s).temperature) is not None]
+        return Samples(found[0].stamps_s + start_s, found[0].values) if found else None
 
     def _compare_sensors(self, solution: Solution | None, progress: Progress
                          ) -> SensorComparison:
@@ -274,10 +284,11 @@ class Calibrator:
         seen = evidence_of_detection(self.detection, self.scenes.built())
         return replace(
             seen, timing=timing,
-            warnings=(*seen.warnings, *self.scenes.warnings, *self._lost),
+            warnings=(*seen.warnings, *self.scenes.warnings, *self._lost, *(
+                self._warmth.since(seen.start_s).warnings if self._warmth else ())),
             stored=self.scenes.stored_before, left_out=self.scenes.left_out(),
             pictures=None if self._live else self.workers.pictures(), motion=self._motion,
-            sensors=sensors)
+            sensors=sensors, temperature=spared('the temperature', [], self._temperature))
 
     # other cameras ----------------------------------------------------------------------------
 

@@ -23,7 +23,7 @@ from dashcalib_ros.input import Frame, FrameSource
 from dashcalib_ros.input.decode import check_mask, mask_of
 from dashcalib_ros.input.inputs import Paths, as_list, fits_bag, open_frames
 from dashcalib_ros.input.motion import SensorStream
-from dashcalib_ros.input.motion_files import bag_motion, read_motion
+from dashcalib_ros.input.motion_files import bag_motion, read_motion, read_temperature
 from dashcalib_ros.input.poses import Poses, track_poses
 from dashcalib_ros.input.source import size_text
 from dashcalib_ros.judge import Check, Odometry
@@ -54,11 +54,15 @@ class Observer:
 
 @dataclass(frozen=True)
 class Recording:
-    """A recorded drive: its frames, where they are not to be used, and the car's sensors."""
+    """A recorded drive: its frames, where they are not to be used, and the car's sensors.
+
+    warmth: with the temperature, where a file of its own has it.
+    """
 
     source: FrameSource
     mask: Mask | None = None
     motion: SensorStream | None = None
+    warmth: SensorStream | None = None
 
 
 @dataclass(frozen=True)
@@ -80,25 +84,34 @@ def open_drive(path: Paths, topic: str | None = None, fps: float | None = None,
                motion: MotionOrPath = None,
                sensor_topics: Mapping[str, str | None] = MappingProxyType({}),
                crop: Part | None = None, stamps: str | os.PathLike[str] | None = None,
-               columns: Mapping[str, str] | None = None, sensor_offset_s: float = 0.0
-               ) -> Recording:
+               columns: Mapping[str, str] | None = None, sensor_offset_s: float = 0.0,
+               temperature: str | None = None) -> Recording:
     """Open a recorded drive; the parameters are those of calibrate().
 
     sensor_topics: of a bag, by imu, gps and odom. stamps: a list of the times of a folder's
     images. columns: of a CSV, as read_motion()'s. sensor_offset_s: to add to the stamps of the
-    sensors. Raises InputError.
+    sensors. temperature: of the camera, a CSV or a topic of a bag. Raises InputError.
     """
     valid, paths = mask_of(mask), as_list(path)
     source = open_frames(paths, topic, fps, start_s, duration_s, stamps)
     source = source if crop is None else source.cropped(*crop)
     if isinstance(motion, SensorStream):
         return Recording(source, valid, _on_clock_of(source, motion))
-    sensors = drive_motion(paths, motion, sensor_topics, topic, columns)
-    if sensors is not None:
+    warmth = None
+    if temperature is not None and Path(temperature).exists():
+        warmth = read_temperature(path_of(temperature))
+    elif temperature is not None:
+        sensor_topics = {**sensor_topics, 'temperature': temperature}
+
+    def placed(sensors: SensorStream | None) -> SensorStream | None:
+        if sensors is None:
+            return None
         sensors = _on_clock_of(source, sensors.shifted(sensor_offset_s))
         # it counts from the drive's first image, not from the first one that is used
-        sensors = sensors if sensors.absolute else sensors.shifted(-start_s)
-    return Recording(source, valid, sensors)
+        return sensors if sensors.absolute else sensors.shifted(-start_s)
+
+    sensors = drive_motion(paths, motion, sensor_topics, topic, columns)
+    return Recording(source, valid, placed(sensors), placed(warmth))
 
 
 def _on_clock_of(source: FrameSource, sensors: SensorStream) -> SensorStream:
@@ -175,8 +188,9 @@ def learned_drive(drive: Recording, config: Config | None, observer: Observer, v
     """Give a calibrator that has taken every frame and what the sensors say."""
     calibrator = Calibrator(config, drive.mask, verbose)
     try:
-        if drive.motion is not None:
-            calibrator.sense(drive.motion)
+        streams = [each for each in (drive.motion, drive.warmth) if each is not None]
+        if streams:
+            calibrator.sense(*streams)
         _feed(calibrator, drive, observer)
         yield calibrator
     finally:
@@ -201,21 +215,25 @@ def drive_motion(path: Paths, motion: str | os.PathLike[str] | None = None,
                  ) -> SensorStream | None:
     """Return the sensors' data of the file motion, else of the bags; None if there is none.
 
-    chosen: the bag's topics by imu, gps and odom; topic: its image topic. columns: of the file, as
-    read_motion()'s. Raises InputError for a
-    file of another kind, and for a topic that does not exist.
+    chosen: the bag's topics by imu, gps, odom and temperature; topic: its image topic. columns: of
+    the file, as read_motion()'s. Raises InputError for a file of another kind, and for a topic
+    that does not exist.
     """
     wanted = {name: topic for name, topic in chosen.items() if topic is not None}
     if motion is not None:
         if wanted:
-            raise InputError('E-MOTION-TWICE', '--imu, --gps and --odom choose topics of a bag: '
-                                               'omit them or --motion')
+            raise InputError('E-MOTION-TWICE', '--imu, --gps, --odom and --temperature choose '
+                                               'topics of a bag: omit them or --motion')
         return read_motion(path_of(motion), columns)
     if columns:
         raise InputError('E-COLUMNS-WITHOUT-MOTION', '--columns names those of a CSV: add '
                                                      '--motion FILE')
     try:
         bags = [each for each in map(Path, as_list(path)) if each.exists() and fits_bag(each)]
+        if not bags and 'temperature' in wanted:
+            raise InputError('E-TEMPERATURE-MISSING', f'there is no file '
+                             f'{wanted["temperature"]}, nor a bag with a topic of this name: '
+                             f'check --temperature')
         return bag_motion(bags, wanted, topic) if bags else None
     except (InputError, OSError, ValueError):
         if wanted:
@@ -321,7 +339,8 @@ def calibrate(path: Paths, fps: float | None = None, config: Settings = None,
               topic: str | None = None, start_s: float = 0.0,
               duration_s: float | None = None, mask: MaskOrPath = None,
               progress: Progress | None = None, motion: MotionOrPath = None,
-              model: str | None = None, crop: Part | None = None) -> Calibration:
+              model: str | None = None, crop: Part | None = None,
+              temperature: str | None = None) -> Calibration:
     """Calibrate a recorded drive.
 
     path: a ROS 2 bag (folder, .mcap, .db3), a ROS 1 .bag, a video, a folder of images, or several
@@ -339,13 +358,16 @@ def calibrate(path: Paths, fps: float | None = None, config: Settings = None,
     model: the lens model, over that of config: radial, brown, fisheye, or auto.
     crop: (x, y, width, height) of the part of the pictures that is used, px, as one of two cameras
     side by side; the mask is of that part, and so is the camera.
+    temperature: of the camera, which its focal length may follow: the path of a CSV (stamp_s and
+    temperature, in degrees Celsius), or a topic of the bag.
 
     Returns a Calibration: its verdict.level is 'accepted', 'weak' or 'refused', and its camera is
     None if it is refused; accepted() returns it, or raises. Raises InputError for input that
     cannot be read, ConfigError for a bad setting, WorkerError if a child process cannot run.
     """
     settings = settings_of(config, model)
-    drive = open_drive(path, topic, fps, start_s, duration_s, mask, motion, crop=crop)
+    drive = open_drive(path, topic, fps, start_s, duration_s, mask, motion, crop=crop,
+                       temperature=temperature)
     with Calls(progress) as observer:
         return calibrate_drive(drive, settings, observer)
 

@@ -85,13 +85,13 @@ class Desk:
         return self.bench.until(spun)
 
     def give(self, level='accepted', complete=True, sigma=SIGMA, warnings=(), turns=(),
-             mount=None, **changes):
+             mount=None, drift=None, temperature_c=None, **changes):
         """Let the learner's thread come up with a calibration."""
         camera = dataclasses.replace(FIRST, **changes) if level != 'refused' else None
         calibration = Calibration(
             Verdict(level, () if level == 'accepted' else (Notice('', 'few turns'),)),
             (320, 240), camera, sigma if camera else None, turns, 10, 0.3, {}, {}, Config(),
-            warnings=warnings, mount=mount)
+            warnings=warnings, mount=mount, drift=drift, temperature_c=temperature_c)
         result = Result(calibration, complete, self.drive.learner.bank)
         done = []
         self.drive._later(lambda: self.drive.on_result(result))

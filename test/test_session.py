@@ -28,6 +28,7 @@ def folder(shared_drive, tmp_path_factory):
     rates = np.gradient(np.interp(seconds, stamps_s, drive.yaw[:ONE_TURN]), seconds)
     lines = [f'{at:.3f},0,0,{rate:.6f}' for at, rate in zip(seconds, rates, strict=True)]
     (folder / 'gyro.csv').write_text('\n'.join(['stamp_s,gyro_x,gyro_y,gyro_z', *lines]))
+    (folder / 'warm.csv').write_text('stamp_s,temperature\n0,20\n100,120\n')
     changed = {name: value for name, value in QUICK.flat().items()
                if value != type(QUICK)().flat()[name]}
     (folder / 'config.yaml').write_text(yaml.safe_dump(changed))
@@ -39,16 +40,20 @@ def command(folder):
     """Return the result.json of the command."""
     main(['run', str(folder / 'drive'), '--fps', str(SPEC.rate), '--quiet',
           '--motion', str(folder / 'gyro.csv'), '--config', str(folder / 'config.yaml'),
-          '--out', str(folder / 'out')])
+          '--temperature', str(folder / 'warm.csv'), '--out', str(folder / 'out')])
     return json.loads((folder / 'out' / 'result.json').read_text())
 
 
 def test_command_and_python_give_the_same_numbers(folder, command, tmp_path):
-    found = calibrate(folder / 'drive', fps=SPEC.rate, config=QUICK, motion=folder / 'gyro.csv')
+    found = calibrate(folder / 'drive', fps=SPEC.rate, config=QUICK, motion=folder / 'gyro.csv',
+                      temperature=str(folder / 'warm.csv'))
     found.save(tmp_path)
     python = json.loads((tmp_path / 'result.json').read_text())
     # the gyro counts in both
     assert python['witnesses']['gyro'] is not None
+    # it rises by 1 K each second
+    [turn] = [turn for turn in python['turns'] if turn['used']]
+    assert abs(python['temperature_c'] - 20 - (turn['stamp'] - found.start_s)) < 1
     command.pop('timing'), python.pop('timing')
     assert python == command
 

@@ -12,6 +12,7 @@ from synthetic import LENS, SIZE, synthetic_turn
 
 from dashcalib_ros.camera import Camera, Radial
 from dashcalib_ros.config import Config
+from dashcalib_ros.input.motion import Samples
 from dashcalib_ros.problem.quadratic import Quadratic
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve import solve
@@ -29,8 +30,9 @@ def scenes_of(count: int, camera: Camera = LENS, seed: int = 0, start: Camera = 
             for world, yaw in enumerate(YAWS[:count])]
 
 
-def solved(scenes: Sequence[Scene], config: Config = CONFIG) -> Solution:
-    solution = solve(scenes, config)
+def solved(scenes: Sequence[Scene], config: Config = CONFIG, temperature: Samples | None = None
+           ) -> Solution:
+    solution = solve(scenes, config, temperature)
     assert solution is not None
     return solution
 

@@ -139,6 +139,12 @@ class Camera(ABC):
         return replace(self, image_size=image_size, fx=self.fx * x, fy=self.fy * y,
                        cx=self.cx * x + (x - 1) / 2, cy=self.cy * y + (y - 1) / 2)
 
+    def zoomed(self, times: float) -> Self:
+        """Return the camera of pictures that grew so many times about their middle."""
+        x, y = ((side - 1) / 2 for side in self.image_size)
+        return replace(self, fx=self.fx * times, fy=self.fy * times,
+                       cx=x + times * (self.cx - x), cy=y + times * (self.cy - y))
+
     def without_distortion(self) -> Self:
         """Return the camera with all distortion coefficients 0."""
         return self.of(self.image_size, [*self.params[:4], *np.zeros(len(self.names()) - 4)])

@@ -44,7 +44,7 @@ KINDS = ('orbslam', 'vins', 'openvins', 'stella', 'svo', 'droid', 'metashape', '
          'colmap-db', 'gyroflow', 'kalibr', 'opensfm', 'nerfstudio', 'mrcal', 'foxglove',
          'autoware', 'vision_pilot', 'ros', 'opencv', 'rays', 'maps', 'urdf', 'tf')
 SENSOR_COLUMNS = ('time', 'gyro_x', 'gyro_y', 'gyro_z', 'speed', 'latitude', 'longitude',
-                  'altitude')
+                  'altitude', 'temperature')
 LENSES = ('radial', 'brown', 'fisheye', 'windscreen', 'shutter', 'stabilised', 'straight')
 # files that no command takes as a drive
 NO_DRIVES = ('.yaml', '.yml', '.json', '.xml', '.txt', '.csv', '.npz')
@@ -177,6 +177,15 @@ def _seconds(text: str) -> float:
     return seconds + sum(60.0**place * int(each) for place, each in enumerate(reversed(first), 1))
 
 
+class Celsius(float):
+    """A temperature, where there may be a time, too."""
+
+
+def _moment(text: str) -> float:
+    return (Celsius(text.rstrip('°C')) if text.endswith('C')
+            else _seconds(text.removesuffix('s')))
+
+
 def path_or(cure: str) -> Callable[[str], Path]:
     """Return a type of argument: a path that is not - (standard output elsewhere)."""
     def path(text: str) -> Path:
@@ -274,14 +283,17 @@ MOTION: tuple[Argument, ...] = (
                           'oxts folder, or a video that contains them'}),
     ('--columns', {'type': columns, 'metavar': 'NAME=COLUMN,...',
                    'help': 'which columns of the CSV are time, gyro_x, gyro_y, gyro_z, speed, '
-                           'latitude, longitude, altitude; a heading may name its unit (t_ms, '
-                           'wx [deg/s], speed_kmh)'}),
+                           'latitude, longitude, altitude, temperature; a heading may name its '
+                           'unit (t_ms, wx [deg/s], speed_kmh)'}),
     ('--sensor-offset', {'type': number('seconds such as 0.5, 3600s or -1h', lambda _: True,
                                         _offset), 'default': 0.0, 'metavar': 'S',
                          'help': "added to the sensors' stamps, as --sensor-offset=-3600s"}),
     *((f'--{name}', {'metavar': 'TOPIC',
                      'help': f"the bag's {what} topic, if there are several"})
       for name, what in (('imu', 'Imu'), ('gps', 'NavSatFix'), ('odom', 'Odometry or Twist'))),
+    ('--temperature', {'metavar': 'FILE',
+                       'help': 'the temperature of the camera, which its focal length may follow: '
+                               "a CSV (header: stamp_s,temperature, in °C), or a bag's topic"}),
     ('--gyro-scale-sigma', {'type': number('0 or more', lambda value: value >= 0), 'metavar': 'S',
                             'help': "relative standard deviation (sigma) of the gyro's scale; "
                                     'default: 0.03; a calibrated gyro has about 0.001'}))
@@ -391,12 +403,13 @@ COMMANDS = {
                                 'does not say the size of its pictures, that size'}),
             ('--crop', {'type': whole_numbers(',', 4, '0,100,1280,520'), 'metavar': 'X,Y,W,H',
                         'help': 'for this part of the pictures'}),
-            ('--at', {'type': number('0 or more seconds, such as 12.5s or 1:30',
-                                     lambda value: value >= 0,
-                                     lambda text: _seconds(text.removesuffix('s'))),
-                      'metavar': 'S',
+            ('--at', {'type': number('0 or more seconds, such as 12.5s or 1:30, or degrees '
+                                     'Celsius such as 35C', lambda value: isinstance(
+                                         value, Celsius) or value >= 0, _moment),
+                      'metavar': 'S|C',
                       'help': 'of a result.json whose camera changes during the drive: the one '
-                              'S seconds after the first image'}),
+                              'S seconds after the first image, or at C degrees Celsius, such '
+                              'as 35C'}),
             ('--nearest', {**FLAG, 'help': 'of a lens that ROS has no model for (omni, double '
                                            'sphere, EUCM, FOV, division ...), write the nearest '
                                            'one, and say by how many px it is off'}),

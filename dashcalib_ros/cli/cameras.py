@@ -9,7 +9,7 @@ import numpy as np
 from rich.console import Group
 
 from dashcalib_ros.arrays import plain_values
-from dashcalib_ros.cli.arguments import ACCEPTED, UsageError
+from dashcalib_ros.cli.arguments import ACCEPTED, Celsius, UsageError
 from dashcalib_ros.cli.terminal import print_json, show, warn
 from dashcalib_ros.errors import Notice
 from dashcalib_ros.formats import export as exported
@@ -62,7 +62,12 @@ def export(args: argparse.Namespace) -> int:
     """Write the camera to --out, or to standard output."""
     found = load_camera(args.calibration, image_size=args.size, nearest=args.nearest)
     warn(found.warnings)
-    if args.at is not None:
+    if isinstance(args.at, Celsius):
+        if found.drift is None or found.drift.fx_percent_per_kelvin is None:
+            raise UsageError('E-NO-TEMPERATURE', 'the focal length is not known to follow the '
+                             'temperature: omit --at, or calibrate with --temperature')
+        found = replace(found, camera=found.at_temperature(args.at), covariance=None)
+    elif args.at is not None:
         camera, sigma = load_calibration(args.calibration).at(args.at)
         found = replace(found, camera=camera, sigma=sigma, covariance=None)
     camera, readout_ms = found.camera, found.readout_ms

@@ -78,4 +78,5 @@ def open_drive(args: argparse.Namespace) -> Recording:
     return session.open_drive(args.input, args.topic, args.fps, args.start, duration_s,
                               args.mask, getattr(args, 'motion', None), topics, args.crop,
                               args.stamps, getattr(args, 'columns', None),
-                              getattr(args, 'sensor_offset', 0.0))
+                              getattr(args, 'sensor_offset', 0.0),
+                              getattr(args, 'temperature', None))

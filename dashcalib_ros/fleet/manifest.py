@@ -19,12 +19,13 @@ from dashcalib_ros.errors import ConfigError, InputError, one_line, shortened
 from dashcalib_ros.fleet import storage
 from dashcalib_ros.fleet.storage import needs
 from dashcalib_ros.input.inputs import VIDEO_SUFFIXES
+from dashcalib_ros.input.motion import HOTTEST_C
 from dashcalib_ros.input.source import IMAGE_SUFFIXES, is_bag_file
 from dashcalib_ros.limits import MANIFEST_BYTES, MANIFEST_ROWS
 from dashcalib_ros.store.scene_file import LAST_S
 from dashcalib_ros.store.scene_file import SUFFIX as GATHERED
 
-COLUMNS = ('clip', 'camera', 'make', 'fps', 'topic', 'time', 'known')
+COLUMNS = ('clip', 'camera', 'make', 'fps', 'topic', 'time', 'known', 'temperature')
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +35,8 @@ class Row:
     clip: as written, without credentials; place, which may have some, is nowhere shown or kept.
     camera: '' where it is unknown, then the clip is a camera of its own. make: '' where unknown.
     time_s: when it was recorded, s since 1970; None where unknown. known: settings known.* of its
-    camera. problem: why this row cannot be used, '' if it can.
+    camera. temperature_c: mean of the clip, degrees Celsius; None where unknown. problem: why this
+    row cannot be used, '' if it can.
     """
 
     number: int
@@ -47,6 +49,7 @@ class Row:
     time_s: float | None = None
     problem: str = ''
     known: tuple[tuple[str, str], ...] = ()
+    temperature_c: float | None = None
 
     @property
     def name(self) -> str:
@@ -173,7 +176,7 @@ READERS: dict[str, Callable[[str, bytes], Iterator[Values]]] = {
 def _row(number: int, values: Values, folder: str) -> Row:
     if isinstance(values, str):
         return Row(number, '', '', problem=values)
-    clip, camera, make, fps, topic, time, known = (
+    clip, camera, make, fps, topic, time, known, temperature = (
         '' if values.get(name) is None else str(values[name]).strip() for name in COLUMNS)
     if not clip:
         return Row(number, '', '', camera, make, problem='names no clip')
@@ -181,7 +184,8 @@ def _row(number: int, values: Values, folder: str) -> Row:
               topic=topic or None)
     try:
         return replace(row, fps=_rate(fps) if fps else None, time_s=_time(time) if time else None,
-                       known=_known(known))
+                       known=_known(known),
+                       temperature_c=_temperature(temperature) if temperature else None)
     except (ValueError, ConfigError) as error:
         return replace(row, problem=str(error))
 
@@ -199,6 +203,14 @@ def _rate(text: str) -> float:
         if 0 < rate <= 1000:
             return rate
     raise ValueError(f'fps must be above 0 and at most 1000, not {shortened(text, 40)}')
+
+
+def _temperature(text: str) -> float:
+    with suppress(ValueError):
+        found = float(text.replace(',', '.'))
+        if abs(found) <= HOTTEST_C:
+            return found
+    raise ValueError(f'temperature must be in degrees Celsius, not {shortened(text, 40)}')
 
 
 def _time(text: str) -> float:

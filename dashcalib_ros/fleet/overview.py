@@ -12,7 +12,7 @@ from urllib.parse import quote
 import numpy as np
 
 from dashcalib_ros.errors import shortened
-from dashcalib_ros.fleet.tables import YEAR_S
+from dashcalib_ros.fleet.tables import YEAR_S, drift_of
 from dashcalib_ros.report.charts import Axes, log_ticks, strokes, svg, text, ticks
 from dashcalib_ros.report.files import REPORT
 from dashcalib_ros.report.page import template
@@ -25,6 +25,8 @@ LISTED = 2000
 MAKES = 20
 # sigmas; a camera drifts beyond so many
 DRIFTS = 3
+# points of such a line
+ENDS = 9
 LEVELS = ('accepted', 'weak', 'refused')
 YEAR_0 = 1970
 # clips and cameras that are named in a row
@@ -37,7 +39,9 @@ TITLES = {
     'sigma px': 'standard deviation over the picture, in px, the best rotation removed',
     'prior %': 'share of the information about fx that is from other units of the model',
     'clips used': 'of all clips of the camera', 'fx, % per year': 'change of fx with time',
-    'sigma, % per year': 'standard deviation of that change'}
+    'sigma, % per year': 'standard deviation of that change',
+    'fx, % per K': 'change of fx with the temperature',
+    'sigma, % per K': 'standard deviation of that change'}
 
 Rows = Sequence[Mapping[str, Any]]
 
@@ -156,31 +160,53 @@ def _sigma_by_clips(cameras: Rows, clips: Rows) -> Section:
 
 def _drift(cameras: Rows, clips: Rows) -> Section:
     own = {row['camera']: row for row in cameras if row['fx']}
-    found = [(YEAR_0 + row['time'] / YEAR_S, 100 * (row['fx'] / own[row['camera']]['fx'] - 1),
-              row['camera']) for row in clips
-             if row['time'] and row['fx'] and row['camera'] in own]
+    by_camera: dict[str, list[Mapping[str, Any]]] = {}
+    for row in clips:
+        by_camera.setdefault(row['camera'], []).append(row)
+    lines = {name: line for name, those in by_camera.items()
+             if name in own and (line := drift_of(those))}
+    warm = {name for name, line in lines.items()
+            if len(line.size) > 1 and abs(line.size[1]) > DRIFTS * line.sigma[1]}
+    found = []
+    for row in clips:
+        name = row['camera']
+        if row['time'] and row['fx'] and name in own:
+            fx = row['fx']
+            if name in warm and row['temperature_c'] is not None:
+                line = lines[name]
+                fx /= 1 + line.size[1] / 100 * (row['temperature_c'] - line.temperature_c)
+            found.append((YEAR_0 + row['time'] / YEAR_S, 100 * (fx / own[name]['fx'] - 1), name))
     if not found:
         return Section('Drift')
     x, y = _ends([year for year, _, _ in found]), _ends([off for _, off, _ in found])
     axes = Axes(900, 320, x, y)
     parts = [axes.frame('year', 'fx of a clip, % off its camera', ticks(*x), ticks(*y)),
              _dots(axes, [(year, off, own[name]['verdict']) for year, off, name in found])]
-    drifting = sorted((row for row in cameras if row['drift_sigma']
-                       and abs(row['drift_percent_per_year']) > DRIFTS * row['drift_sigma']),
-                      key=lambda row: -abs(row['drift_percent_per_year']))
-    for row in drifting[:MAKES]:
-        own_clips = np.array([each[:2] for each in found if each[2] == row['camera']])
-        if len(own_clips):
-            middle, off = own_clips.mean(axis=0)
-            ends = np.array([own_clips[:, 0].min(), own_clips[:, 0].max()])
-            line = off + row['drift_percent_per_year'] * (ends - middle)
-            parts.append(strokes([axes.places(ends, line)], 'all-turns'))
+    drifting = sorted((name for name, line in lines.items()
+                       if name in warm or abs(line.size[0]) > DRIFTS * line.sigma[0]),
+                      key=lambda name: -abs(lines[name].size[0]))
+    for name in drifting[:MAKES]:
+        line = lines[name]
+        years = [year for year, _, each in found if each == name]
+        if not years:
+            continue
+        ends = np.linspace(min(years), max(years), ENDS)
+        off, sigma = np.transpose([line.at(year - YEAR_0) for year in ends])
+        off = off + 100 * (line.fx / own[name]['fx'] - 1)
+        parts.append(strokes([axes.places(ends, off)], 'all-turns'))
+        parts.append(strokes([axes.places(ends, off + each) for each in (sigma, -sigma)],
+                             'all-turns', ' stroke-dasharray="3 4"'))
+    rows = []
+    for name in drifting:
+        size, sigma = (tuple(f'{each:+.2g}' if n == 0 else f'{each:.2g}' for each in values)
+                       for n, values in enumerate((lines[name].size, lines[name].sigma)))
+        rows.append((name, size[0], sigma[0], *((size[1], sigma[1]) if size[1:] else ('-', '-'))))
     return Section(
-        'Drift', ('camera', 'fx, % per year', 'sigma, % per year'),
-        [(row['camera'], f'{row["drift_percent_per_year"]:+.2f}', f'{row["drift_sigma"]:.2f}')
-         for row in drifting],
-        *_figure(f'dots: fx from each dated clip alone; lines: cameras whose fx drifts by more '
-                 f'than {DRIFTS} sigma', axes, parts))
+        'Drift', ('camera', 'fx, % per year', 'sigma, % per year', 'fx, % per K',
+                  'sigma, % per K'), rows,
+        *_figure(f'dots: fx from each dated clip alone, at one temperature where fx follows it; '
+                 f'lines: cameras whose fx drifts by more than {DRIFTS} sigma, with one sigma',
+                 axes, parts))
 
 
 def _ends(values: Sequence[float]) -> tuple[float, float]:

@@ -11,6 +11,7 @@ import json
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from dashcalib_ros.fleet.manifest import Row
 from dashcalib_ros.fleet.solved import ClipShare, Final, Solved
 from dashcalib_ros.fleet.storage import has, joined, write
 from dashcalib_ros.judge.calibration import ANGLES
+from dashcalib_ros.solve.evidence import LEAST_SPAN_K
 from dashcalib_ros.store.scene_file import DATES_S
 
 PARAMETERS = tuple(dict.fromkeys(name for model in calibrated_models() for name in model.names()))
@@ -49,14 +51,17 @@ CAMERA_COLUMNS = {
     **dict.fromkeys(('clips', 'clips_used', 'clips_left_out', 'clips_unreadable', 'turns',
                      'turns_used'), 'number'),
     'seconds': 'real', 'prior_units': 'number', 'prior_share': 'real', 'prior_note': 'text',
-    'other_mode': 'flag', 'drift_percent_per_year': 'real', 'drift_sigma': 'real',
+    'other_mode': 'flag', **dict.fromkeys(
+        ('drift_percent_per_year', 'drift_sigma', 'percent_per_kelvin', 'sigma_per_kelvin'),
+        'real'),
     **dict.fromkeys(('reasons', 'reason_codes', 'warnings'), 'texts'), 'folder': 'text'}
 CLIP_COLUMNS = {
     'row': 'number',
     **dict.fromkeys(('clip', 'camera', 'make', 'status', 'reason', 'code'), 'text'),
     'width': 'number', 'height': 'number', 'frames': 'number', 'seconds': 'real',
     **dict.fromkeys(('turns', 'scenes', 'turns_used'), 'number'),
-    **dict.fromkeys(('fx', 'sigma_fx_noise', 'sigma_fx_so_far', 'time'), 'real'),
+    **dict.fromkeys(('fx', 'sigma_fx_noise', 'sigma_fx_so_far', 'time', 'temperature_c'),
+                    'real'),
     'content': 'text', 'file': 'text', 'warnings': 'texts'}
 
 
@@ -90,7 +95,7 @@ def camera_row(solved: Solved, final: Final, clips: Sequence[Mapping[str, Any]])
 def failed_row(camera: str, make: str, clips: Sequence[Mapping[str, Any]],
                why: Exception | str = '') -> dict[str, Any]:
     """Return the row of a camera without a result: of its clips, and why there is none."""
-    drift, drift_sigma = _drift(clips)
+    drift = drift_of(clips)
     count = Counter(row['status'] for row in clips)
     return {
         **dict.fromkeys(CAMERA_COLUMNS), 'camera': camera, 'make': make or None,
@@ -100,7 +105,7 @@ def failed_row(camera: str, make: str, clips: Sequence[Mapping[str, Any]],
         'turns_used': sum(row['turns_used'] for row in clips),
         'seconds': float(sum(row['seconds'] for row in clips)), 'prior_units': 0,
         'prior_share': 0.0, 'prior_note': '', 'other_mode': False,
-        'drift_percent_per_year': drift, 'drift_sigma': drift_sigma,
+        **({} if drift is None else drift.columns),
         'reasons': [coded(why, LONGEST)], 'reason_codes': [code_of(why)], 'warnings': [],
         'folder': camera_folder(camera)}
 
@@ -131,7 +136,8 @@ def clip_rows(camera: str, make: str, clips: Sequence[tuple[Row, ClipResult]],
             **vars(result), 'row': row.number, 'clip': row.clip, 'camera': camera,
             'make': make or None, 'status': status, 'reason': reason, 'code': code,
             'turns_used': share.used, 'fx': share.fx, 'sigma_fx_noise': share.fx_sigma,
-            'sigma_fx_so_far': share.sigma_so_far, 'time': time})
+            'sigma_fx_so_far': share.sigma_so_far, 'time': time,
+            'temperature_c': row.temperature_c})
     return found
 
 
@@ -150,24 +156,66 @@ def _status(result: ClipResult, share: ClipShare) -> tuple[str, str, str]:
     return 'no scene' if result.turns else 'no turn', coded(why), why.code
 
 
-def _drift(clips: Sequence[Mapping[str, Any]]) -> tuple[float | None, float | None]:
-    """Return by how much fx changes in a year, %, and its sigma; None without dates.
+@dataclass(frozen=True)
+class FleetDrift:
+    """A line through the fx of a camera's clips, by their times and temperatures.
+
+    fx: at the middle of both, with its sigma in percent; year: since 1970, and temperature_c: of
+    that middle, None where temperatures do not count. size, sigma: (k,) percent of fx per year
+    and, where they count, per kelvin.
+    """
+
+    fx: float
+    sigma_percent: float
+    year: float
+    temperature_c: float | None
+    size: tuple[float, ...]
+    sigma: tuple[float, ...]
+
+    @property
+    def columns(self) -> dict[str, float]:
+        """Return the columns of the table of cameras."""
+        return {**dict(zip(('drift_percent_per_year', 'percent_per_kelvin'), self.size,
+                           strict=False)),
+                **dict(zip(('drift_sigma', 'sigma_per_kelvin'), self.sigma, strict=False))}
+
+    def at(self, year: float) -> tuple[float, float]:
+        """Return by how many percent fx is off at a time, and its sigma, at that temperature."""
+        since = year - self.year
+        return self.size[0] * since, float(np.hypot(self.sigma_percent, self.sigma[0] * since))
+
+
+def drift_of(clips: Sequence[Mapping[str, Any]]) -> FleetDrift | None:
+    """Return how the fx of a camera's clips changes; None without dates.
 
     A line through the fx of each clip alone, weighted; sigma grows with the scatter about it.
+    Where half of the clips have temperatures, and these differ, those clips count, and what the
+    temperature explains is no drift.
     """
-    known = [(row['time'], row['fx'], row['sigma_fx_noise']) for row in clips
-             if row['sigma_fx_noise'] and row['time'] is not None]
-    if len({time for time, _, _ in known}) < LEAST_CLIPS:
-        return None, None
-    time, fx, sigma = np.array(known).T
+    known = [row for row in clips if row['sigma_fx_noise'] and row['time'] is not None]
+    warm = [row for row in known if row['temperature_c'] is not None]
+    by_temperature = len(warm) > max(LEAST_CLIPS, len(known) / 2 - 1) and np.ptp(
+        [row['temperature_c'] for row in warm]) >= LEAST_SPAN_K
+    known = warm if by_temperature else known
+    if len({row['time'] for row in known}) < LEAST_CLIPS:
+        return None
+    fx, sigma = (np.array([row[key] for row in known]) for key in ('fx', 'sigma_fx_noise'))
+    ways = np.array([(row['time'] / YEAR_S, row['temperature_c'] if by_temperature else 0.0)
+                     for row in known])[:, :1 + by_temperature]
     weight = 1 / sigma**2
-    years = (time - np.average(time, weights=weight)) / YEAR_S
-    mean = float(np.average(fx, weights=weight))
-    variance = 1 / float(np.sum(weight * years**2))
-    slope = variance * float(np.sum(weight * years * (fx - mean)))
-    scatter = float(np.sum(weight * (fx - mean - slope * years)**2)) / (len(known) - 2)
+    middle, mean = np.average(ways, axis=0, weights=weight), np.average(fx, weights=weight)
+    ways -= middle
+    if np.linalg.matrix_rank(ways) < ways.shape[1]:
+        return None  # the later, the warmer: nothing tells one from the other
+    covariance = np.linalg.inv(ways.T * weight @ ways)
+    slopes = covariance @ (ways.T @ (weight * (fx - mean)))
+    left = float(np.sum(weight * (fx - mean - ways @ slopes)**2))
+    scatter = max(left / (len(known) - 1 - len(slopes)), 1.0)
     percent = 100 / mean
-    return percent * slope, percent * float(np.sqrt(variance * max(scatter, 1.0)))
+    return FleetDrift(
+        float(mean), float(percent * np.sqrt(scatter / weight.sum())), float(middle[0]),
+        float(middle[1]) if by_temperature else None, tuple((percent * slopes).tolist()),
+        tuple((percent * np.sqrt(scatter * np.diag(covariance))).tolist()))
 
 
 def write_table(out: str, name: str, rows: Sequence[Mapping[str, Any]],

@@ -94,6 +94,7 @@ def result_dict(calibration: CalibrationData) -> dict[str, Any]:
         'witnesses': c.witnesses,
         'known': c.known,
         'drift': c.drift,
+        'temperature_c': c.temperature_c,
         'intrinsics_at': c.intrinsics_at,
         'parts': c.parts,
         'input': c.input_name,
@@ -186,7 +187,7 @@ def calibration_of(data: Data, camera: Camera | None) -> CalibrationData:
         witnesses=Witnesses(**{name: made(Witness, each) for name, each
                                in (data.get('witnesses') or {}).items()}),
         known=tuple(made(Known, each) for each in data.get('known', ())),
-        drift=made(Drift, data.get('drift')),
+        drift=made(Drift, data.get('drift')), temperature_c=data.get('temperature_c'),
         intrinsics_at=tuple(made(CameraAt, each) for each in data.get('intrinsics_at', ())),
         parts=tuple(made(Part, {**each, 'sigma_px': made(PictureSigma, each['sigma_px'])})
                     for each in data.get('parts', ())))
@@ -253,7 +254,8 @@ def _provenance(calibration: CalibrationData, created: str | None) -> dict[str, 
         'input': calibration.input_name,
         'seed': calibration.config.seed,
         'versions': calibration.versions,
-        **({} if calibration.part is None else {'part': calibration.part}),
+        **{name: value for name in ('part', 'drift', 'temperature_c')
+           if (value := getattr(calibration, name)) is not None},
         **({} if calibration.mount is None else {'mount': _mount_dict(calibration.mount)}),
     })
     return block if created is None else {**block, 'created': created}
@@ -285,7 +287,9 @@ def _read(data: Data, path: Path) -> NamedCamera:
         sigma_px=_readable(_sigma_px, values.get('sigma_px')),
         field=_used_field(values.get('field'), camera.image_size),
         mount=_readable(_mount, values.get('mount')),
-        readout_ms=_readable(_readout_ms, values.get('rolling_shutter')))
+        readout_ms=_readable(_readout_ms, values.get('rolling_shutter')),
+        drift=_readable(_drift, values.get('drift')),
+        temperature_c=_readable(lambda of: read_number(of, 'temperature_c', path), values))
 
 
 def _intrinsics(data: Data, path: Path) -> Camera:
@@ -326,7 +330,8 @@ def calibrated_camera(calibration: CalibrationData, name: str = 'estimate') -> N
                        covariance, calibration.sigma_px,
                        field.field if field is not None and field.used else None,
                        mount=calibration.mount,
-                       readout_ms=None if shutter is None else shutter.readout_ms)
+                       readout_ms=None if shutter is None else shutter.readout_ms,
+                       drift=calibration.drift, temperature_c=calibration.temperature_c)
 
 
 def _covariance(details: Any, camera: Camera, sigma: Mapping[str, float] | None
@@ -395,6 +400,16 @@ def _mount(data: Any) -> Mount:
                  (travel[0], travel[1]), read_number(data, 'travel_sigma_px', ''),
                  read_number(data, 'straight_m', ''),
                  known({'moved_s': None, **data}, 'moved_s'))
+
+
+def _drift(data: Any) -> Drift:
+    def known(name: str) -> float | None:
+        return None if data.get(name) is None else read_number(data, name, '')
+
+    return Drift(read_number(data, 'fx_percent_per_hour', ''), read_number(data, 'sigma', ''),
+                 read_number(data, 'from_first_to_last_percent', ''),
+                 known('fx_percent_per_kelvin'), known('sigma_per_kelvin'), known('from_c'),
+                 known('to_c'))
 
 
 def _sigma_px(data: Any) -> PictureSigma:

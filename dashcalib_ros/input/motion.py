@@ -44,6 +44,8 @@ DAMAGED = 0.2
 FASTEST_TURN = 6.0
 # the same for the whole drive, by the 99th percentile, where single peaks do not count
 QUANTILE = 99.0
+# degrees Celsius; kelvins were written for them
+HOTTEST_C = 150.0
 # m/s; a car that is slower stands; a sensor that never says more does not know of driving
 STANDING_MPS, DRIVING_MPS = 0.3, 3.0
 # s over which positions tell a speed
@@ -86,8 +88,9 @@ class SensorStream:
     """Motion sensor data of a drive; each is None if there is no such sensor.
 
     rate: (n, 3) rad/s about the sensor's own three axes, in any mounting. speed: (n, 1) m/s.
-    position: (n, 3) m, east, north and up from the first. Stamps: s since the drive's first
-    image; absolute: on the clock of the images, since 1970 as bags and GPX have them.
+    position: (n, 3) m, east, north and up from the first. temperature: (n, 1) of the camera,
+    degrees Celsius. Stamps: s since the drive's first image; absolute: on the clock of the images,
+    since 1970 as bags and GPX have them.
     warnings: what was skipped, one line each. begin_s: time of day of the drive's first image, for
     images without one; None: unknown. doubt_s: by how much that may be off.
     """
@@ -95,6 +98,7 @@ class SensorStream:
     rate: Samples | None = None
     speed: Samples | None = None
     position: Samples | None = None
+    temperature: Samples | None = None
     warnings: tuple[Notice, ...] = ()
     absolute: bool = False
     begin_s: float | None = None
@@ -103,7 +107,7 @@ class SensorStream:
     @property
     def empty(self) -> bool:
         """Return whether there is nothing to use."""
-        return self.rate is None and self.speed is None and self.position is None
+        return not self.kinds
 
     @property
     def kinds(self) -> Mapping[str, Samples]:
@@ -280,7 +284,8 @@ def _nowhere(places: Floats) -> npt.NDArray[np.bool_]:
     return np.asarray(nowhere)
 
 
-NAMES = {'rate': 'angular rates', 'speed': 'speeds', 'position': 'positions'}
+NAMES = {'rate': 'angular rates', 'speed': 'speeds', 'position': 'positions',
+         'temperature': 'temperatures'}
 
 
 def _cleaned(stamps_s: Floats, values: Floats, kind: str) -> tuple[Samples | None, str]:
@@ -298,6 +303,8 @@ def _cleaned(stamps_s: Floats, values: Floats, kind: str) -> tuple[Samples | Non
     if kind == 'rate' and np.percentile(np.abs(samples.values), QUANTILE) > FASTEST_TURN:
         return None, (f'{np.percentile(np.abs(samples.values), QUANTILE):.0f} rad/s is too fast '
                       f'for a car; write rad/s, not degrees per second')
+    if kind == 'temperature' and np.abs(samples.values).max() > HOTTEST_C:
+        return None, 'no camera is so warm; write degrees Celsius'
     if kind == 'position' and not np.ptp(samples.values, axis=0).max() < FARTHEST_M:
         return None, 'they are too far apart for one drive'
     return samples, ''
@@ -353,8 +360,8 @@ def speeds_of(stream: SensorStream) -> Samples | None:
 def values_in(message: Any, option: str) -> Iterator[tuple[str, tuple[float, ...]]]:
     """Yield the kinds of values in a message of ROS 1 or 2, as SensorBuffer takes them.
 
-    option: gps, imu or odom, by the message's type. NaN of a GPS without a fix, and of an IMU that
-    says that it has no gyro.
+    option: gps, imu, odom or temperature, by the message's type. NaN of a GPS without a fix, and
+    of an IMU that says that it has no gyro.
     """
     if option == 'gps':
         place = (message.latitude, message.longitude, message.altitude)
@@ -364,6 +371,8 @@ def values_in(message: Any, option: str) -> Iterator[tuple[str, tuple[float, ...
         rate = message.angular_velocity
         known = message.angular_velocity_covariance[0] != NO_DATA
         yield 'rate', (rate.x, rate.y, rate.z) if known else NOTHING
+    elif option == 'temperature':
+        yield 'temperature', (message.temperature,)
     else:
         twist = message.twist
         twist = getattr(twist, 'twist', twist)
@@ -390,6 +399,11 @@ class SensorBuffer:
         """Take a sample. kind: as values_in() yields it; stamp_s: since 1970."""
         kept = self._kept.setdefault(kind, deque(maxlen=self._length))
         kept.append((stamp_s, tuple(values)))
+
+    def newest(self, kind: str) -> tuple[float, tuple[float, ...]] | None:
+        """Return the newest sample of a kind, its stamp first."""
+        kept = self._kept.get(kind)
+        return kept[-1] if kept else None
 
     def stream(self, what: str = 'the topic') -> SensorStream:
         """Return what there is; what: where it comes from, for warnings."""

@@ -50,8 +50,10 @@ if TYPE_CHECKING:
 
 # columns of a CSV by their stream
 STAMP_COLUMN = 'stamp_s'
+# of which one is used only where it is chosen: a car has many thermometers
+TEMPERATURE = 'temperature'
 COLUMNS = {'rate': ('gyro_x', 'gyro_y', 'gyro_z'), 'speed': ('speed',),
-           'position': ('latitude', 'longitude', 'altitude')}
+           'position': ('latitude', 'longitude', 'altitude'), TEMPERATURE: (TEMPERATURE,)}
 # what --columns calls the stamp
 STAMP_OPTION = 'time'
 _PHYPHOX = {STAMP_COLUMN: 'Time (s)'}
@@ -76,7 +78,8 @@ GCSV, GCSV_LINES, GCSV_TSCALE = 'GYROFLOW IMU LOG', 100, 1e-3
 GCSV_COLUMNS = {STAMP_COLUMN: 't', **{f'gyro_{axis}': f'g{axis}' for axis in 'xyz'}}
 # headings of angular rates in degrees per second, and of speeds in km/h
 DEGREES, KMH = re.compile(r'deg|dps|°'), re.compile(r'km/?h|kph')
-HEAD = f'stamp_s and any of {", ".join(chain(*COLUMNS.values()))}'
+HEAD = f'stamp_s and any of {", ".join(chain(*COLUMNS.values()))}'.removesuffix(
+    f', {TEMPERATURE}')
 # places in a line of KITTI's oxts: latitude, longitude, altitude; forward speed; rates x, y, z
 OXTS_POSITION, OXTS_SPEED, OXTS_RATE, OXTS_VALUES = slice(0, 3), 8, slice(17, 20), 30
 # characters of a GPX that are parsed at once
@@ -85,7 +88,8 @@ GPX_PIECE = 2**22
 GOPRO_FIX, GOPRO_BLOCK_S = '0x47505346', 1.0
 # message types by the option that chooses one of their topics
 TYPES = {'imu': ('sensor_msgs/msg/Imu',), 'gps': ('sensor_msgs/msg/NavSatFix',),
-         'odom': ('nav_msgs/msg/Odometry', 'geometry_msgs/msg/TwistStamped')}
+         'odom': ('nav_msgs/msg/Odometry', 'geometry_msgs/msg/TwistStamped'),
+         TEMPERATURE: ('sensor_msgs/msg/Temperature',)}
 # what a damaged message raises
 NO_MESSAGE = (InputError, AttributeError, TypeError, ValueError)
 # s between stamps and reception, beyond what a slow network makes; messages that tell it
@@ -108,6 +112,15 @@ def read_motion(path: Path, columns: Mapping[str, str] | None = None) -> SensorS
     if _first_line(path, what).startswith('<'):
         return _gpx(read_text(path, GPX_BYTES, what), path)
     return _csvs([path], path, columns)
+
+
+def read_temperature(path: Path) -> SensorStream:
+    """Read the temperature of a camera from a CSV. Raises InputError where it has none."""
+    found = _csvs([path], path, {STAMP_COLUMN: STAMP_COLUMN, TEMPERATURE: TEMPERATURE})
+    if found.temperature is None:
+        raise InputError('E-TEMPERATURE-UNUSABLE', f'{found.warnings[0]}; use lines of '
+                         f'{STAMP_COLUMN},{TEMPERATURE} in rising order')
+    return found
 
 
 def is_motion(path: Path) -> bool:
@@ -165,7 +178,7 @@ def _csv(lines: Iterator[str], path: Path, columns: Mapping[str, str] | None
                 break
             scales[key] = _number(value)
     names, mark = _names(head), _mark(head)
-    ours = columns or _log_of(path) or {name: name for name in names}
+    ours = columns or _log_of(path) or {name: name for name in names if name != TEMPERATURE}
     missing = [theirs for theirs in ours.values() if theirs not in names]
     if columns and missing:
         raise InputError('E-MOTION-COLUMNS', f'{path} has no column {missing[0]!r}: use those of '
@@ -413,9 +426,9 @@ def bag_motion(paths: Iterable[Path], chosen: Mapping[str, str | None],
                images: str | None = None) -> SensorStream | None:
     """Return the sensor data of a bag, on the clock of its images; None if it has none.
 
-    chosen: topic by imu, gps and odom; None: the only one of its type. Of several without a choice
-    none is used, and a warning lists them. images: their topic; None: the only one. Raises
-    InputError for a chosen topic that does not exist.
+    chosen: topic by imu, gps, odom and temperature; None: the only one of its type, but no
+    temperature. Of several without a choice none is used, and a warning lists them. images: their
+    topic; None: the only one. Raises InputError for a chosen topic that does not exist.
     """
     from dashcalib_ros.input.bag_storage import open_bag
     samples = SensorBuffer(SAMPLES + 1)
@@ -426,6 +439,8 @@ def bag_motion(paths: Iterable[Path], chosen: Mapping[str, str | None],
         for option, types in TYPES.items():
             found = [topic for topic in bag.topics if topic.msgtype in types and topic.count]
             name = chosen.get(option)
+            if name is None and option == TEMPERATURE:
+                continue
             if name is not None:
                 found = [topic for topic in found if topic.name.strip('/') == name.strip('/')]
                 if not found:

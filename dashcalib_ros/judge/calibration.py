@@ -324,11 +324,21 @@ class Drift:
     """A focal length that changes over the drive, as of a lens that warms up.
 
     fx_percent_per_hour, with its sigma; from_first_to_last_percent: over the turns.
+    fx_percent_per_kelvin, with sigma_per_kelvin: where it follows the temperature, which is from_c
+    to to_c degrees Celsius in these turns; None: it does not, or nobody measured it.
     """
 
     fx_percent_per_hour: float
     sigma: float
     from_first_to_last_percent: float
+    fx_percent_per_kelvin: float | None = None
+    sigma_per_kelvin: float | None = None
+    from_c: float | None = None
+    to_c: float | None = None
+
+    def zoom(self, apart_k: float) -> float:
+        """Return how many times as large fx is at so many kelvins above a calibration's."""
+        return 1 + (self.fx_percent_per_kelvin or 0.0) / 100 * apart_k
 
 
 @dataclass(frozen=True)
@@ -399,7 +409,9 @@ class CalibrationData:
     fits the calibration without it, full-size images' px; () for fewer than three turns.
     straight_lines: the distortion by upright lines of the world; None: too few of them.
     witnesses: the focal length by the car's own sensors. known: what somebody knew before.
-    drift: of the focal length; camera is that of the middle of the drive then. None: it is steady.
+    drift: of the focal length; camera is that of the middle of the drive then, or that of
+    temperature_c where the focal length follows it. None: it is steady. temperature_c: mean of the
+    turns, degrees Celsius; None: unknown.
     intrinsics_at: the camera over the time, where it drifts, zooms or steps. parts: before and
     after a step.
     part: (x, y, width, height) of the pictures, px, that camera and all else are of; None: all.
@@ -433,6 +445,7 @@ class CalibrationData:
     witnesses: Witnesses = default(default_factory=Witnesses)
     known: tuple[Known, ...] = ()
     drift: Drift | None = None
+    temperature_c: float | None = None
     intrinsics_at: tuple[CameraAt, ...] = ()
     parts: tuple[Part, ...] = ()
     start_s: float = 0.0

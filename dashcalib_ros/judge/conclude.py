@@ -20,7 +20,7 @@ from dashcalib_ros.detect.one_camera import OtherCamera
 from dashcalib_ros.detect.straights import Straights
 from dashcalib_ros.detect.turn import Turn, TurnId
 from dashcalib_ros.errors import Notice, counted, spared
-from dashcalib_ros.input.motion import SensorStream, speeds_of
+from dashcalib_ros.input.motion import Samples, SensorStream, speeds_of
 from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge.agreement import CONTRADICTS, focal_disagreement
 from dashcalib_ros.judge.calibration import (
@@ -52,6 +52,7 @@ from dashcalib_ros.judge.verdict import (
     yaw_in_all,
 )
 from dashcalib_ros.judge.witnesses import SensorComparison
+from dashcalib_ros.problem.blocks import Warmth
 from dashcalib_ros.reconstruct.scene import Scene, TurnPicture, picture_of, rms_px
 from dashcalib_ros.solve.evidence import largest_crop
 from dashcalib_ros.solve.solution import Solution, cross_validation
@@ -71,7 +72,8 @@ class Evidence:
     out, in words. pictures: of turns whose images are gone; None: the report is not wanted.
     start_s: stamp of the first image. lines: upright ones, in the resized images; None where they
     were not looked for. straights: pairs of images of straight driving, likewise. motion: of the
-    car's sensors; sensors: what they say. other_camera: that the stream has, too.
+    car's sensors; sensors: what they say. other_camera: that the stream has, too. temperature: on
+    the images' clock.
     """
 
     image_size: tuple[int, int]
@@ -92,6 +94,7 @@ class Evidence:
     motion: SensorStream | None = None
     sensors: SensorComparison = default(default_factory=SensorComparison)
     other_camera: OtherCamera | None = None
+    temperature: Samples | None = None
 
 
 def evidence_of_detection(detection: Detection, scenes: Iterable[Scene | None] = ()) -> Evidence:
@@ -167,7 +170,7 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
         found = replace(found, parts=tuple(
             _part(part, solution, later, evidence, config)
             for later, part in enumerate(solution.parts)))
-    return replace(found, warnings=(*found.warnings, *_warnings(found, solution), *lost))
+    return replace(found, warnings=(*found.warnings, *_warnings(found, solution, evidence), *lost))
 
 
 def outlook(scenes: Sequence[Scene], evidence: Evidence, config: VerdictConfig) -> Verdict:
@@ -199,6 +202,7 @@ def _with_numbers(found: CalibrationData, solution: Solution, lines: Bend | None
     held_out = spared('the comparison of each turn with the others', lost, cross_validation,
                       solution) or ()
     px = solution.px
+    warmth = _warmth(solution, evidence)
     camera, sigma = _in_input(solution.camera, solution.sigma, px, evidence.image_size)
     units, wide = camera.units(px), camera.widened().units(px)
     return replace(
@@ -211,7 +215,8 @@ def _with_numbers(found: CalibrationData, solution: Solution, lines: Bend | None
         straight_lines=lines and lines.resized(px), field=_field(solution, evidence.image_size),
         mount=spared('the mounting', lost, _mount, solution, evidence, found.verdict.level,
                      found.config),
-        drift=_drift(solution), intrinsics_at=_over_time(solution, evidence),
+        drift=_drift(solution), temperature_c=None if warmth is None else warmth.mean_c,
+        intrinsics_at=_over_time(solution, evidence),
         rolling_shutter=Shutter(1e3 * solution.readout_s, 1e3 * solution.readout_sigma_s)
         if solution.rolling else None)
 
@@ -225,7 +230,19 @@ def _drift(solution: Solution) -> Drift | None:
     if found is None or not found.linear:
         return None
     per_hour = 100 * 3600 / found.seconds
-    return Drift(per_hour * found.size, per_hour * found.sigma, 100 * found.size)
+    drift = Drift(per_hour * found.size, per_hour * found.sigma, 100 * found.size)
+    warmth, of_kelvin = found.ways.warmth, found.of_kelvin
+    if warmth is None or of_kelvin is None:
+        return drift
+    value, sigma = of_kelvin
+    return replace(drift, fx_percent_per_kelvin=100 * value, sigma_per_kelvin=100 * sigma,
+                   from_c=warmth.coldest_c, to_c=warmth.warmest_c)
+
+
+def _warmth(solution: Solution, evidence: Evidence) -> Warmth | None:
+    """Return the temperature of the turns; None where it is not known of all."""
+    return Warmth.over(evidence.temperature, [
+        scene.tracks.stamps_ns for scene in solution.scenes if scene.turn.of_this_drive])
 
 
 def _over_time(solution: Solution, evidence: Evidence) -> tuple[CameraAt, ...]:
@@ -268,10 +285,15 @@ def _part(part: Solution | None, whole: Solution, later: int, evidence: Evidence
 REPORTED_FIELD_PX = 0.5
 
 
-def _warnings(found: CalibrationData, solution: Solution) -> tuple[Notice, ...]:
+def _warnings(found: CalibrationData, solution: Solution, evidence: Evidence
+              ) -> tuple[Notice, ...]:
     """Return what the user must know of the numbers, which are no reason for the verdict."""
     level, model, field = found.verdict.level, found.config.model, found.field
     warnings = []
+    if evidence.temperature is not None and _warmth(solution, evidence) is None:
+        warnings.append(Notice(
+            'E-TEMPERATURE-TIMES', 'the temperature is not used: it was not measured at the times '
+            'of all turns; check its time stamps'))
     if level != 'accepted' and model != AUTO:
         warnings.append(Notice(
             'E-MODEL-CHOSEN',
@@ -298,13 +320,19 @@ def _warnings(found: CalibrationData, solution: Solution) -> tuple[Notice, ...]:
     said = {'E-FOCAL-LENGTH-DRIFTS', 'E-FOCAL-LENGTH-STEPS'}.intersection(found.verdict.codes)
     if level != 'refused' and solution.drift is not None and not said:
         drift = found.drift
-        how = (f'{100 * solution.drift.largest:.2f} % during the drive' if drift is None else
-               f'{drift.from_first_to_last_percent:+.2f} % from the first turn to the last '
-               f'({drift.fx_percent_per_hour:+.1f} ± {drift.sigma:.1f} % an hour), as of a lens '
-               f'that warms up')
+        how = f'{100 * solution.drift.largest:.2f} % during the drive'
+        of = 'the middle of the drive'
+        if drift is not None and drift.fx_percent_per_kelvin is not None:
+            how = (f'{drift.fx_percent_per_kelvin:+.3f} ± {drift.sigma_per_kelvin:.3f} % per '
+                   f'kelvin, from {drift.from_c:.0f} to {drift.to_c:.0f} °C')
+            of = f'{found.temperature_c:.1f} °C'
+        elif drift is not None:
+            how = (f'{drift.from_first_to_last_percent:+.2f} % from the first turn to the last '
+                   f'({drift.fx_percent_per_hour:+.1f} ± {drift.sigma:.1f} % an hour), as of a '
+                   f'lens that warms up')
         warnings.append(Notice(
             'E-FOCAL-LENGTH-DRIFT', f'the focal length changes by {how}: camera_info is that of '
-            f'the middle of the drive; `dashcalib export --at` writes that of another time'))
+            f'{of}; `dashcalib export --at` writes that of another time'))
     if found.mount is not None and found.mount.moved_s is not None:
         warnings.append(Notice(
             'E-CAMERA-MOVED',

@@ -24,7 +24,7 @@ from dashcalib_ros.camera import Camera, misread
 from dashcalib_ros.camera.field import Field
 from dashcalib_ros.camera.mapping import Apart, apart, as_model, sensitivity
 from dashcalib_ros.errors import InputError, Notice
-from dashcalib_ros.judge.calibration import Mount
+from dashcalib_ros.judge.calibration import Drift, Mount
 from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.solve.spread import PictureSigma, SigmaMap, sigma_over
 
@@ -251,7 +251,7 @@ class NamedCamera:
     picture; None where the file does not say.
     field: what its lens model leaves over, where a result.json has one that is used. mount: how it
     sits on the car, where the file says. readout_ms: of a rolling shutter, from the first row to
-    the last; None where the file has none.
+    the last; None where the file has none. drift, temperature_c: as CalibrationData's.
     faults: in words, of what else stands beside the camera (ROS's K, R and P). warnings: of what
     is odd in the camera itself.
     """
@@ -267,6 +267,18 @@ class NamedCamera:
     readout_ms: float | None = default(default=None, compare=False)
     faults: tuple[str, ...] = ()
     warnings: tuple[Notice, ...] = default(default=(), compare=False)
+    drift: Drift | None = default(default=None, compare=False)
+    temperature_c: float | None = default(default=None, compare=False)
+
+    def at_temperature(self, now_c: float) -> Camera:
+        """Return the camera at a temperature, degrees Celsius, but no farther than was seen.
+
+        The same one where its focal length is not known to follow the temperature.
+        """
+        drift, of_c = self.drift, self.temperature_c
+        if drift is None or of_c is None or drift.from_c is None or drift.to_c is None:
+            return self.camera
+        return self.camera.zoomed(drift.zoom(min(max(now_c, drift.from_c), drift.to_c) - of_c))
 
     def without_faults(self) -> NamedCamera:
         """Return it; raises InputError where something beside the camera is wrong."""

@@ -24,6 +24,7 @@ from dashcalib_ros.camera.field import TERMS, Field, field_terms
 from dashcalib_ros.camera.mapping import sensitivity, turned
 from dashcalib_ros.camera.rotation import crossed
 from dashcalib_ros.detect.turn import TurnId
+from dashcalib_ros.input.motion import Samples
 from dashcalib_ros.problem.observations import Observed, Stretch, main_axis
 from dashcalib_ros.problem.quadratic import Quadratic
 
@@ -450,11 +451,48 @@ class Bend(SharedBlock):
 
 # what changes with time
 
+# s before the first sample of a temperature and after the last one for which they stand
+BESIDE_S = 60.0
+
+
+@dataclass(frozen=True)
+class Warmth:
+    """The temperature during a drive, degrees Celsius. samples: (n, 1), on the images' clock.
+
+    mean_c: of its turns; coldest_c, warmest_c: in them.
+    """
+
+    samples: Samples
+    mean_c: float
+    coldest_c: float
+    warmest_c: float
+
+    @classmethod
+    def over(cls, samples: Samples | None, turns_ns: Sequence[Ints]) -> Warmth | None:
+        """Return that of turns, by the stamps (k,) of each; None where it is not known of all."""
+        if samples is None or not turns_ns:
+            return None
+        stamps_s = np.concatenate(turns_ns) / 1e9
+        first, last = samples.stamps_s[0] - BESIDE_S, samples.stamps_s[-1] + BESIDE_S
+        if stamps_s.min() < first or stamps_s.max() > last:
+            return None
+        then = [samples.at(own / 1e9) for own in turns_ns]
+        every = np.concatenate(then)
+        return cls(samples, float(np.mean([own.mean() for own in then])), float(every.min()),
+                   float(every.max()))
+
+    @property
+    def span_k(self) -> float:
+        """Return by how many kelvins it changes."""
+        return self.warmest_c - self.coldest_c
+
+
 @dataclass(frozen=True)
 class Drift(SharedBlock):
     """By how much the picture grows during the drive, of 1; (c,), one for each way of growing.
 
-    Steadily from its begin to its end, as of a lens that warms up, where steady; and at each of
+    With the time from its begin to its end, as of a lens that warms up, where steady; with the
+    temperature from its coldest turn to its warmest, where there is warmth; and at each of
     steps_ns, as where somebody touches the lens. begin_ns, end_ns: of the drive. sigma: of the
     prior. Earlier drives have their own temperature, and none of it.
     """
@@ -464,6 +502,7 @@ class Drift(SharedBlock):
     end_ns: int = 1
     sigma: float = 0.01
     steady: bool = True
+    warmth: Warmth | None = None
     steps_ns: tuple[int, ...] = ()
 
     name: ClassVar[str] = 'drift'
@@ -480,16 +519,20 @@ class Drift(SharedBlock):
         return np.eye(len(self.value)) * self.sigma**-2, self.value
 
     def grown(self, observed: Observed) -> Floats:
-        """Return (n, c) how far each way is at each observation, -0.5 before it and 0.5 after."""
+        """Return (n, c) how far each way is at each observation, of 1, from its middle."""
         if not observed.turn.of_this_drive:
             return np.zeros((len(observed.xy), len(self.value)))
         return self.grown_at(observed.stamps_ns)
 
     def grown_at(self, stamps_ns: Ints) -> Floats:
         """Return (n, c) the same at stamps (n,)."""
-        late = (stamps_ns - self.begin_ns) / (self.end_ns - self.begin_ns)
-        return np.stack([*([late] if self.steady else []), *(
-            stamps_ns >= step_ns for step_ns in self.steps_ns)], axis=1) - 0.5
+        ways = [(stamps_ns >= step_ns) - 0.5 for step_ns in self.steps_ns]
+        if self.warmth is not None:
+            warm = self.warmth.samples.at(stamps_ns / 1e9)[:, 0] - self.warmth.mean_c
+            ways.insert(0, warm / self.warmth.span_k)
+        if self.steady:
+            ways.insert(0, (stamps_ns - self.begin_ns) / (self.end_ns - self.begin_ns) - 0.5)
+        return np.stack(ways, axis=1)
 
 
 # what each image has of its own

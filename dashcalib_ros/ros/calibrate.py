@@ -2,6 +2,7 @@
 """The program that calibrates: what is accepted is published beside the images, and kept."""
 from __future__ import annotations
 
+import math
 from functools import partial
 
 from sensor_msgs.msg import CameraInfo
@@ -24,6 +25,9 @@ from dashcalib_ros.ros.images import Source
 from dashcalib_ros.ros.settings import Settings
 from dashcalib_ros.ros.state import Judgement, judge, outcome_text, sigma_text
 from dashcalib_ros.ros.store import CameraIdentity, Store, StoredCalibration, camera_info_path
+
+# s; an older temperature says nothing of now; px of fx, by which camera_info follows it
+OLD_S, LEAST_PX = 60.0, 0.01
 
 
 class Calibrating:
@@ -48,6 +52,7 @@ class Calibrating:
         self._mounting = Mounting(endpoints, own)
         # what is published now, and how many were published beside images
         self._info: CameraInfo | None = None
+        self._shown: Camera | None = None
         self._sent = 0
         self._kept: StoredCalibration | None = None
         # given up, and published only because of publish_stale
@@ -87,10 +92,25 @@ class Calibrating:
 
     def accompany(self, header: Header, size: tuple[int, int]) -> None:
         """Publish the camera_info of an image, if the camera has such images."""
+        self._follow_temperature(header)
         if self._info is not None and (self._info.width, self._info.height) == size:
             self._info.header = header
             self._beside.publish(self._info)
             self._sent += 1
+
+    def _follow_temperature(self, header: Header) -> None:
+        """Let what is published beside images be the camera at the temperature now."""
+        kept, newest = self._kept, self.drive.learner.sensors.newest('temperature')
+        if kept is None or kept.camera.temperature_c is None or newest is None:
+            return
+        stamp_s = header.stamp.sec + 1e-9 * header.stamp.nanosec
+        # without a thermometer it is that of the calibration
+        now_c = (newest[1][0] if abs(stamp_s - newest[0]) < OLD_S and math.isfinite(newest[1][0])
+                 else kept.camera.temperature_c)
+        camera = kept.camera.at_temperature(now_c)
+        if self._shown is not None and abs(camera.fx - self._shown.fx) > LEAST_PX:
+            self._shown = camera
+            self._info = camera_info(camera, header, self._core.rectified)
 
     def _load(self) -> None:
         try:
@@ -146,12 +166,15 @@ class Calibrating:
         # by request, or with other stored turns: count once
         again = self._trusted() is not None and bool(turns) and turns <= self._counted
         judged = Judgement('keep') if again else judge(
-            calibration, result.complete, self._trusted(), self._contradictions, self._own)
+            calibration, result.complete, self._trusted(), self._contradictions, self._own,
+            self._kept.days if self._kept else 0.0)
         match judged.action:
-            case 'adopt' | 'replace':
+            case 'adopt' | 'follow' | 'replace':
                 if judged.action == 'replace':
                     self._log.warning(f'the calibration is replaced: {judged.why}')
-                self._adopt(calibration)
+                elif judged.action == 'follow':
+                    self._log.info(f'the calibration follows the newest turns: {judged.why}')
+                self._adopt(judged.calibration or calibration)
                 self.drive.learner.restart()
             case 'give_up':
                 self._log.error(f'the published calibration is withdrawn: {judged.why}')
@@ -216,7 +239,8 @@ class Calibrating:
 
     def _use(self, kept: StoredCalibration, confirmed: bool = True) -> CameraInfo:
         self._kept, self._stale, self._confirmed = kept, False, confirmed
-        self._info = camera_info(kept.camera.camera, self._header(kept.frame_id or ''),
+        self._shown = kept.camera.camera
+        self._info = camera_info(self._shown, self._header(kept.frame_id or ''),
                                  self._core.rectified)
         self._latch(self._info)
         self._show_mount(kept.mount, kept.frame_id or '')
@@ -234,7 +258,7 @@ class Calibrating:
         if self._info is not None:
             # K[0] = 0 says that it is uncalibrated (sensor_msgs)
             self._latch(CameraInfo(header=self._header(self._info.header.frame_id)))
-        self._kept, self._stale, self._info = None, False, None
+        self._kept, self._stale, self._info, self._shown = None, False, None, None
         self._mounting.show(None, '')
         self._watch()
 

@@ -176,7 +176,7 @@ def subscribe_sensors(endpoints: Endpoints, own: NodeConfig, add: AddMeasurement
     """
     for name, option in SENSORS.items():
         # as parameters named the topics up to version 0.2
-        topic = getattr(own, f'{name}_topic')
+        topic = getattr(own, f'{name}_topic', '')
         if not (topic or getattr(own, f'use_{name}')):
             continue
         try:

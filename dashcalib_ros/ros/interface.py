@@ -67,9 +67,9 @@ PUBLISHED = _by_name(
           'the state and what is missing, once a second, also while the node is inactive',
           always=True))
 
-# topics of the car's own sensors, which are subscribed with use_imu and so on, and the options of
-# the command that have the same
-SENSORS = {'imu': 'imu', 'odom': 'odom', 'fix': 'gps'}
+# topics of sensors, which are subscribed with use_imu and so on, and the options of the command
+# that have the same
+SENSORS = {'imu': 'imu', 'odom': 'odom', 'fix': 'gps', 'temperature': 'temperature'}
 SUBSCRIBED = _by_name(
     Topic('image_raw', 'sensor_msgs/msg/Image',
           'or image_raw/compressed with image_transport:=compressed; with video the first of '
@@ -86,7 +86,10 @@ SUBSCRIBED = _by_name(
     Topic('odom', 'nav_msgs/msg/Odometry', 'with use_odom: the speed, for the height of the '
                                            'camera', 400, reliable=False),
     Topic('fix', 'sensor_msgs/msg/NavSatFix', 'with use_fix: independent evidence for fx', 400,
-          reliable=False))
+          reliable=False),
+    Topic('temperature', 'sensor_msgs/msg/Temperature',
+          'with use_temperature: of the camera; where fx follows it, camera_info is that of the '
+          'temperature now', 10, reliable=False))
 
 # what rclpy publishes and offers for each node with a lifecycle and parameters
 OF_RCLPY = {

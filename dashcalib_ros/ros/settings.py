@@ -27,7 +27,7 @@ LIST = 'mask.segmentation_classes'
 CHANGEABLE = ('commit', 'publish_stale', 'turns.wanted')
 # a checker publishes and keeps nothing
 CALIBRATOR_ONLY = frozenset((
-    'camera_info_url', 'commit', 'commit_timeout', 'publish_stale', 'better', 'contradictions',
+    'camera_info_url', 'commit', 'commit_timeout', 'publish_stale', 'contradictions',
     'base_frame', 'publish_tf', 'camera_frame', 'mount_x', 'mount_y', 'mount_z'))
 HELP = """\
 usage: ros2 run dashcalib_ros {program}
@@ -120,6 +120,9 @@ class NodeConfig:
         False, 'subscribe odom (nav_msgs/Odometry), whose speed gives the height of the camera')
     use_fix: bool = setting(
         False, 'subscribe fix (sensor_msgs/NavSatFix), independent evidence for fx')
+    use_temperature: bool = setting(
+        False, 'subscribe temperature (sensor_msgs/Temperature of the camera), which the focal '
+               'length may follow')
     imu_topic: str = expert('', 'deprecated: set use_imu, and remap imu with -r imu:=TOPIC')
     odom_topic: str = expert('', 'deprecated: set use_odom, and remap odom with -r odom:=TOPIC')
     fix_topic: str = expert('', 'deprecated: set use_fix, and remap fix with -r fix:=TOPIC')
@@ -130,9 +133,6 @@ class NodeConfig:
         5.0, 'Hz; highest rate of the overlay and of the rectified picture', 0.1, 30.0)
     commit_timeout: float = expert(
         5.0, 's; how long the node waits for the answer of the driver', 0.1, 600.0)
-    better: float = expert(
-        0.7, 'ratio; a new calibration replaces the old one when its standard deviation (sigma) '
-             'of fx is at most this times that of the old one', 0.1, 1.0)
     contradictions: int = expert(
         3, 'contradictions in a row before the old calibration is withdrawn; one or two may be '
            'chance', 1, 20)

@@ -122,6 +122,14 @@ class StoredCalibration:
                    None if edited else camera.mount)
 
     @property
+    def days(self) -> float:
+        """Return its age in days; 0 where the file does not say when it was made."""
+        with suppress(KeyError, TypeError, ValueError):
+            made = datetime.fromisoformat(str(self.content['dashcalib']['created']))
+            return (datetime.now(timezone.utc) - made).total_seconds() / 86400
+        return 0.0
+
+    @property
     def text(self) -> str:
         """Return the file's text."""
         return yaml_text(self.content)

@@ -23,7 +23,8 @@ from dashcalib_ros.arrays import Floats, Ints
 from dashcalib_ros.camera import MODELS
 from dashcalib_ros.camera.mapping import mapping_error
 from dashcalib_ros.detect.turn import TurnId
-from dashcalib_ros.problem.blocks import Bend, Block, Drift, ImageBlock, Shift, Zoom
+from dashcalib_ros.input.motion import Samples
+from dashcalib_ros.problem.blocks import Bend, Block, Drift, ImageBlock, Shift, Warmth, Zoom
 from dashcalib_ros.problem.normal import COMMON_DRIFT, Normal, normal_equations
 from dashcalib_ros.problem.quadratic import Quadratic
 from dashcalib_ros.reconstruct.scene import errors_px
@@ -54,6 +55,8 @@ HIDDEN_DEG, SHARP_DEG = 20.0, 45.0
 # sigmas of a drift of the focal length over a drive among which the evidence chooses, the first
 # as good as none, and the nats it takes; turns at the least
 STEADY, DRIFTS, DRIFT_NATS, LEAST_DRIFTING = 1e-6, (0.002, 0.005, 0.015, 0.05, 0.2), 4.0, 3
+# K; a temperature that changes less says nothing: a lens grows by 0.02 % for each
+LEAST_SPAN_K = 2.0
 # nats by which one way of changing must be ahead of the others: twice as likely
 RIVAL_NATS = 0.7
 # noise variances of a track by which a kind of lens must predict turns better
@@ -334,21 +337,26 @@ def shift_size(found: Estimate) -> float:
     return best if by_size[best] - nats(None) > SHIFT_NATS else 0.0
 
 
-def drifting(found: Estimate) -> Drift | None:
+def drifting(found: Estimate, temperature: Samples | None = None) -> Drift | None:
     """Return how the focal length changes, as the evidence favours it; None for a steady one.
 
     It grows steadily, or steps between two turns; or it does all of that, as a zoom, and where the
-    turns do not tell which. Two turns cannot.
+    turns do not tell which. Two turns cannot. temperature: that it goes with in the place of
+    time, unless that explains it clearly better.
     """
-    turns = sorted((int(stamps.min()), int(stamps.max())) for stamps in (
-        scene.tracks.stamps_ns for scene in found.scenes if scene.turn.of_this_drive))
+    own_ns = [scene.tracks.stamps_ns for scene in found.scenes if scene.turn.of_this_drive]
+    turns = sorted((int(stamps.min()), int(stamps.max())) for stamps in own_ns)
     if len(turns) < LEAST_DRIFTING:
         return None
     begins, ends = [begin for begin, _ in turns], [*accumulate((end for _, end in turns), max)]
     # where turns overlap nothing steps between them
     steps = tuple((end + begin) // 2 for end, begin in zip(ends, begins[1:], strict=False)
                   if end < begin)
-    asked = Drift(np.zeros(1 + len(steps)), begins[0], ends[-1], STEADY, steps_ns=steps)
+    warmth = Warmth.over(temperature, own_ns)
+    if warmth is not None and warmth.span_k < LEAST_SPAN_K:
+        warmth = None
+    asked = Drift(np.zeros(1 + (warmth is not None) + len(steps)), begins[0], ends[-1], STEADY,
+                  warmth=warmth, steps_ns=steps)
     now = found.with_tracks(FIRST_TRACKS).having(asked)
     loss_px = now.loss_px()
     unit = now.noise(loss_px).variance * now.inflation
@@ -364,9 +372,15 @@ def drifting(found: Estimate) -> Drift | None:
         none, *nats = (evidence(cost, now.imaging.having(each), each) for each in sized)
         return max(nats) - none, sized[1 + int(np.argmax(nats))]
 
-    one = replace(asked, value=np.zeros(1))
+    one, kept = replace(asked, value=np.zeros(1), warmth=None), own
     alone = [likeliest_of(replace(one, steps_ns=()), own[:1])]
-    for place, step_ns in zip(own[1:], steps, strict=True):
+    if warmth is not None:
+        warm = likeliest_of(replace(one, steady=False, warmth=warmth, steps_ns=()), own[1:2])
+        follows = warm[0] > max(DRIFT_NATS, alone[0][0] - DRIFT_NATS)
+        alone, kept = ([warm], own[1:]) if follows else (alone, np.delete(own, 1))
+        asked = replace(asked, value=np.zeros(len(kept)), steady=not follows,
+                        warmth=warmth if follows else None)
+    for place, step_ns in zip(kept[1:], steps, strict=True):
         nats, step = likeliest_of(replace(one, steady=False, steps_ns=(step_ns,)), place)
         # any of the steps is as likely as a steady growth
         alone.append((nats - float(np.log(len(steps))), step))
@@ -374,7 +388,7 @@ def drifting(found: Estimate) -> Drift | None:
     if best <= DRIFT_NATS:
         return None
     # where another way is nearly as likely, the sigma of all of them contains it
-    every, ways = likeliest_of(asked, own)
+    every, ways = likeliest_of(asked, kept)
     rival = max((nats for nats, _ in others), default=-np.inf)
     return ways if every > best + DRIFT_NATS or rival > best - RIVAL_NATS else way
 

@@ -12,6 +12,7 @@ from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import AUTO, PINHOLE, Camera, searched
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import TurnId
+from dashcalib_ros.input.motion import Samples
 from dashcalib_ros.problem.blocks import (
     FOCAL_BOUND,
     Block,
@@ -94,7 +95,7 @@ class _Begun:
     profile: Profile
 
 
-def solve(scenes: Sequence[Scene], config: Config,
+def solve(scenes: Sequence[Scene], config: Config, temperature: Samples | None = None,
           progress: Progress = lambda stage, done: None) -> Solution | None:
     """Adjust all scenes with one shared camera; None if it explains none, or none determines it.
 
@@ -102,7 +103,7 @@ def solve(scenes: Sequence[Scene], config: Config,
     drive's turns contradict are left out.
     """
     try:
-        found = _solved(scenes, config, progress)
+        found = _solved(scenes, config, progress, temperature)
         step_ns = None if found is None or found.drift is None else found.drift.step_ns
         return found if found is None or step_ns is None else replace(found, parts=tuple(
             _part(scenes, config, step_ns, later) for later in (False, True)))
@@ -134,7 +135,8 @@ def _of_another_drive(found: Estimate) -> bool:
             or _posterior(found).of_another_drive > CONTRADICTION)
 
 
-def _solved(per_turn: Sequence[Scene], config: Config, progress: Progress) -> Solution | None:
+def _solved(per_turn: Sequence[Scene], config: Config, progress: Progress,
+            temperature: Samples | None = None) -> Solution | None:
     begun = []
     for kind in kinds_of_lenses(per_turn):
         # one kind may be so wrong that nothing determines it
@@ -153,12 +155,13 @@ def _solved(per_turn: Sequence[Scene], config: Config, progress: Progress) -> So
     best = _finished(best)
     # now, as shifts of pictures may make up for another lens
     if _of_another_drive(best):
-        return _solved([scene for scene in per_turn if scene.turn.of_this_drive], config, progress)
+        return _solved([scene for scene in per_turn if scene.turn.of_this_drive], config, progress,
+                       temperature)
     if loose := _perhaps_shifted(best):
         progress('testing whether the picture moves', 0.0)
         best = _with(best, Shift(only=loose))
     steady = best
-    if not best.moves and (drift := drifting(best)) is not None:
+    if not best.moves and (drift := drifting(best, temperature)) is not None:
         best = _with(best, drift)
         for _ in range(DRIFT_ROUNDS):
             best = _finished(best)

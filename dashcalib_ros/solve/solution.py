@@ -27,19 +27,20 @@ LEAST_TURNS = 3
 class FocalDrift:
     """By how much the focal length grows from the first turn's begin to the last one's end, of 1.
 
-    With its sigma. ways: in which it grows, as found.
+    With its sigma. ways: in which it grows, as found; covariance: (c, c) of them.
     """
 
     size: float
     sigma: float
     ways: Drift
+    covariance: Floats
 
     @classmethod
     def of(cls, ways: Drift, covariance: Floats) -> FocalDrift:
         """Return what these ways add up to. covariance: of what turns share, ways' at its end."""
         grows = np.diff(ways.grown_at(np.array([ways.begin_ns, ways.end_ns])), axis=0)[0]
         own = covariance[-len(grows):, -len(grows):]
-        return cls(float(grows @ ways.value), float(np.sqrt(grows @ own @ grows)), ways)
+        return cls(float(grows @ ways.value), float(np.sqrt(grows @ own @ grows)), ways, own)
 
     def moved(self, step: Floats, covariance: Floats) -> FocalDrift:
         """Return it after a step (m,) of what turns share, with the covariance then."""
@@ -49,9 +50,14 @@ class FocalDrift:
     @property
     def largest(self) -> float:
         """Return by how much it differs at the most between two times of the drive, of 1."""
-        steps_ns = np.array(self.ways.steps_ns, np.int64)
-        grown = self.ways.grown_at(np.r_[
-            self.ways.begin_ns, steps_ns - 1, steps_ns, self.ways.end_ns])
+        ways = self.ways
+        steps_ns = np.array(ways.steps_ns, np.int64)
+        times_ns = np.r_[ways.begin_ns, steps_ns - 1, steps_ns, ways.end_ns]
+        if ways.warmth is not None:
+            inner_ns = np.round(1e9 * ways.warmth.samples.stamps_s).astype(np.int64)
+            times_ns = np.r_[times_ns, inner_ns[
+                (inner_ns > ways.begin_ns) & (inner_ns < ways.end_ns)]]
+        grown = ways.grown_at(times_ns)
         return float(np.ptp(grown @ self.ways.value))
 
     @property
@@ -62,12 +68,22 @@ class FocalDrift:
     @property
     def step_ns(self) -> int | None:
         """Return when it steps; None where it does anything else."""
-        return None if self.ways.steady else self.ways.steps_ns[0]
+        ways = self.ways
+        return None if ways.steady or ways.warmth is not None else ways.steps_ns[0]
 
     @property
     def linear(self) -> bool:
-        """Return whether it grows steadily, and nothing else."""
+        """Return whether it grows steadily, or with the temperature, and nothing else."""
         return not self.ways.steps_ns
+
+    @property
+    def of_kelvin(self) -> tuple[float, float] | None:
+        """Return by how much of 1 it grows with each kelvin, and its sigma; None: with time."""
+        warmth = self.ways.warmth
+        if warmth is None or not self.linear:
+            return None
+        sigma = float(np.sqrt(self.covariance[0, 0]))
+        return float(self.ways.value[0]) / warmth.span_k, sigma / warmth.span_k
 
 
 @dataclass(frozen=True)
@@ -143,15 +159,14 @@ class Solution:
             return camera, self.sigma
         ways = self.drift.ways
         grown = ways.grown_at(np.array([stamp_ns]))[0]
-        times = np.where(np.arange(count) < 4, 1 + grown @ ways.value, 1.0)
-        # where the picture grows about its middle, fx, fy and the centre go with it
+        zoom = 1 + float(grown @ ways.value)
+        times = np.where(np.arange(count) < 4, zoom, 1.0)
         still = np.r_[0.0, 0.0, middle(camera.image_size), np.zeros(count - 4)]
         moves = np.where(np.arange(count) < 4, camera.params - still, 0.0)
         follow = times[:, None] * self.written.by_solution
         follow[:, follow.shape[1] - len(grown):] += np.outer(moves, grown)
         covariance = follow @ self.posterior.covariance @ follow.T + self.written.loose
-        return (camera.with_params(still + times * (camera.params - still)),
-                np.sqrt(np.diag(covariance)))
+        return camera.zoomed(zoom), np.sqrt(np.diag(covariance))
 
     @property
     def wide_covariance(self) -> Floats:

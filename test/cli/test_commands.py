@@ -535,14 +535,18 @@ def test_stamps_columns_and_an_offset_reach_the_drive(drive, tmp_path):
     (tmp_path / 'list').write_text('\n'.join(f'{n / 5:.1f}' for n in range(4)))
     (tmp_path / 'log.csv').write_text('t_ms,wx,wy,wz\n' + '\n'.join(
         f'{100 * n},0,0.1,{0.01 * n}' for n in range(20)))
+    (tmp_path / 'warm.csv').write_text('stamp_s,temperature\n0,20\n10,21.5\n')
     opened = open_drive(make_parser().parse_args([
         'run', drive, '--stamps', str(tmp_path / 'list'), '--motion', str(tmp_path / 'log.csv'),
         '--columns', 'time=t_ms,gyro_x=wx,gyro_y=wy,gyro_z=wz', '--sensor-offset=-1h',
+        '--temperature', str(tmp_path / 'warm.csv'),
         '--crop', '8,4,32,16']))
     assert [(frame.stamp_ns, frame.size) for frame in opened.source] == [
         (2 * 10**8 * n, (32, 16)) for n in range(4)]
     np.testing.assert_allclose(opened.motion.rate.stamps_s, 0.1 * np.arange(20) - 3600)
     np.testing.assert_allclose(opened.motion.rate.values[3], [0, 0.1, 0.03])
+    warm = opened.warmth.temperature
+    assert warm.stamps_s.tolist() == [-3600, -3590] and warm.values[1] == [21.5]
 
 
 @pytest.mark.parametrize('wrong', [

@@ -344,6 +344,16 @@ def test_export_writes_the_camera_of_a_time(here, results, tmp_path):
     written = here('export', path, '--to', 'nerfstudio', '--at', '12.5s')
     assert written.returncode == 0
     assert json.loads(written.stdout)['fl_x'] == pytest.approx(1.005 * given['fx'])
+    refused = here('export', path, '--to', 'nerfstudio', '--at', '35C')
+    assert_one_line_error(refused)
+    assert '[E-NO-TEMPERATURE]' in refused.stderr
+    data |= {'temperature_c': 30.0, 'drift': {
+        'fx_percent_per_hour': 0.1, 'sigma': 0.1, 'from_first_to_last_percent': 0.1,
+        'fx_percent_per_kelvin': 0.05, 'sigma_per_kelvin': 0.01, 'from_c': -5.0, 'to_c': 40.0}}
+    path.write_text(json.dumps(data))
+    for at, times in (('38°C', 1.004), ('-2C', 0.984)):
+        written = here('export', path, '--to', 'nerfstudio', f'--at={at}')
+        assert json.loads(written.stdout)['fl_x'] == pytest.approx(times * given['fx'])
 
 
 def test_a_lens_profile_has_the_readout_time_of_its_rows(here, results, tmp_path):

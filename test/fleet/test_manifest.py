@@ -61,6 +61,12 @@ def test_bad_lines_of_json_are_rows(tmp_path):
     assert 'time' in late.problem and 'noon' in late.problem
 
 
+def test_a_clip_has_a_temperature(tmp_path):
+    rows = rows_of(tmp_path, 'clip;camera;temperature\na.mp4;a;-3,5\nb.mp4;a;\nc.mp4;a;293\n')
+    assert [row.temperature_c for row in rows] == [-3.5, None, None]
+    assert 'Celsius' in rows[2].problem and not rows[1].problem
+
+
 def test_parquet(tmp_path):
     arrow = pytest.importorskip('pyarrow')
     from pyarrow import parquet

@@ -28,10 +28,11 @@ from dashcalib_ros.fleet.tables import (
 START_S = 1.7e9
 
 
-def rows_at(times_s, focal, sigma=2.0):
+def rows_at(times_s, focal, sigma=2.0, degrees=None):
     result = ClipResult(file='x.npz', turns=1, scenes=1, seconds=10.0)
-    clips = [(Row(n, f'{n}.mp4', f'/{n}.mp4', 'cam', time_s=time_s), result)
-             for n, time_s in enumerate(times_s)]
+    degrees = [None] * len(times_s) if degrees is None else degrees
+    clips = [(Row(n, f'{n}.mp4', f'/{n}.mp4', 'cam', time_s=time_s, temperature_c=each), result)
+             for n, (time_s, each) in enumerate(zip(times_s, degrees, strict=True))]
     return clip_rows('cam', 'acme', clips, {
         f'{n}.mp4': ClipShare(1, fx=fx, fx_sigma=sigma) for n, fx in enumerate(focal)})
 
@@ -49,6 +50,44 @@ def test_drift_over_time():
     assert abs(drift - 1.0) < 3 * sigma and 0.02 < sigma < 0.2
     # scatter beyond the clips' own sigmas counts
     assert drift_of(rows_at(times, 1000 + 10 * noise))[1] > 5 * sigma
+
+
+def test_what_the_temperature_explains_is_no_drift():
+    rng = np.random.default_rng(1)
+    # from winter to summer
+    years = np.linspace(0, 0.5, 40)
+    degrees = 5 + 50 * years + rng.normal(0, 5, 40)
+    times, noise = START_S + years * tables.YEAR_S, rng.normal(0, 1.0, 40)
+    focal = 1000 * (1 + 0.0003 * (degrees - degrees.mean())) + noise
+    without = failed_row('cam', '', rows_at(times, focal, 1.0))
+    assert without['drift_percent_per_year'] > 5 * without['drift_sigma']
+    assert without['percent_per_kelvin'] is None
+    row = failed_row('cam', '', rows_at(times, focal, 1.0, degrees))
+    assert abs(row['drift_percent_per_year']) < 3 * row['drift_sigma']
+    assert abs(row['percent_per_kelvin'] - 0.03) < 3 * row['sigma_per_kelvin'] < 0.015
+    # dots are drawn as at one temperature
+    clips = rows_at(times, focal, 1.0, degrees)
+    page = overview_html([{**row, 'verdict': 'accepted', 'fx': 1000.0, 'width': 1280,
+                           'sigma_fx': 1.0, 'turns_used': 5}], clips)
+    assert page.count('class="all-turns"') == 2 and '+0.03' in page
+    line = tables.drift_of(clips)
+    assert line.sigma_percent < line.at(line.year + 0.3)[1]
+    assert line.at(line.year) == (0.0, line.sigma_percent)
+
+
+@pytest.mark.parametrize('degrees', [np.full(9, 20.0), [20.0, 30.0] + [None] * 7])
+def test_too_few_temperatures_explain_nothing(degrees):
+    years = np.arange(9)
+    row = failed_row('cam', '', rows_at(START_S + years * tables.YEAR_S, 1000.0 + years,
+                                        1.0, degrees))
+    assert row['percent_per_kelvin'] is None
+    assert row['drift_percent_per_year'] == pytest.approx(0.1, rel=0.01)
+
+
+def test_the_later_the_warmer_tells_neither():
+    years = np.arange(9)
+    assert drift_of(rows_at(START_S + years * tables.YEAR_S, 1000.0 + years, 1.0,
+                            20.0 + years)) == (None, None)
 
 
 @pytest.mark.parametrize('times', [[START_S] * 5, [0.0, 10.0, 20.0], [START_S, 2 * START_S]])
@@ -169,7 +208,8 @@ def test_the_overview_draws_the_fleet():
     page = drawn_fleet()
     assert Page(page).tags.count('svg') == 3
     # fx and sigma of three cameras, five clips, and the line of the one that drifts
-    assert page.count('class="all-turns"') == 1 and page.count('h0') == 3 + 3 + 5
+    # with its sigma
+    assert page.count('class="all-turns"') == 2 and page.count('h0') == 3 + 3 + 5
     for name in ('cameras', 'fx, px', 'sigma fx %', 'fx, % per year'):
         assert f'<button>{name}</button>' in page
     assert '<b>three' not in page and 'http' not in page.split('<body>')[1]

@@ -14,10 +14,17 @@ from rich.console import Console
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import InputError, Notice
-from dashcalib_ros.formats import load_calibration, result_dict, result_json
+from dashcalib_ros.formats import (
+    calibration_yaml,
+    load_calibration,
+    load_camera,
+    result_dict,
+    result_json,
+)
 from dashcalib_ros.judge import Verdict
 from dashcalib_ros.judge.calibration import (
     CameraAt,
+    Drift,
     Part,
     StoredTurnSummary,
     Witness,
@@ -81,6 +88,24 @@ def test_a_camera_that_steps_is_written_and_read_with_both_sides(tmp_path):
     drifting = make_calibration(intrinsics_at=(at(0.0, 1.0), at(100.0, 1.02)))
     assert drifting.at(25.0)[0].fx == pytest.approx(1.005 * TRUTH.fx)
     assert make_calibration().at(25.0) == (TRUTH, SIGMA)
+
+
+def test_a_size_per_kelvin_is_written_and_read_and_gives_other_temperatures(tmp_path):
+    drift = Drift(0.1, 0.05, 0.0, 0.05, 0.01, 20.0, 40.0)
+    calibration = make_calibration(drift=drift, temperature_c=30.0)
+    (tmp_path / 'result.json').write_text(result_json(calibration))
+    (tmp_path / 'calibration.yaml').write_text(calibration_yaml(calibration))
+    for name in ('result.json', 'calibration.yaml'):
+        found, whole = load_camera(tmp_path / name), load_calibration(tmp_path / name)
+        assert (whole.drift, whole.temperature_c) == (drift, 30.0)
+        assert (found.drift, found.temperature_c) == (drift, 30.0)
+        assert found.at_temperature(30.0) == TRUTH
+        # no farther than was seen
+        for at_c, times in ((34.0, 1.002), (60.0, 1.005), (-10.0, 0.995)):
+            assert found.at_temperature(at_c).fx == pytest.approx(times * TRUTH.fx)
+    (tmp_path / 'result.json').write_text(result_json(make_calibration()))
+    found = load_camera(tmp_path / 'result.json')
+    assert found.drift is None and found.at_temperature(60.0) == TRUTH
 
 
 def strict(text):

@@ -425,6 +425,40 @@ def test_of_several_topics_none_is_used_until_one_is_chosen(tmp_path):
         bag_motion([path], {'imu': '/none'})
 
 
+def warmth(n):
+    return '/front/warmth', START + n * 10**9, ROS2.types['sensor_msgs/msg/Temperature'](
+        header=head(START + n * 10**9, ROS2), temperature=20.0 + n, variance=0.0)
+
+
+def test_a_temperature_is_used_where_it_is_chosen(tmp_path):
+    path = write_bag(tmp_path / 'bag', [*images(drive(3)), *(warmth(n) for n in range(5))])
+    assert bag_motion([path], NONE) is None
+    found = open_drive(path, temperature='/front/warmth').motion.temperature
+    assert found.values[:, 0].tolist() == [20.0, 21.0, 22.0, 23.0, 24.0]
+    with refused(InputError, 'E-BAG-TOPIC-UNKNOWN', '/front/warmth'):
+        open_drive(path, temperature='/rear')
+
+
+def test_a_temperature_has_a_file_of_its_own(tmp_path):
+    path = write_timed(tmp_path / 'a.mp4')
+    file = write(tmp_path / 'warm.csv', 'stamp_s,temperature\n0,20.5\n10,\n20,25\n')
+    recording = open_drive(path, temperature=str(file), start_s=0.1)
+    assert recording.motion is None and recording.warmth.temperature.values[1] == [25.0]
+    np.testing.assert_allclose(recording.warmth.temperature.stamps_s, [-0.1, 19.9])
+    # a chip's, beside its rates
+    file = write(tmp_path / 'imu.csv', 'stamp_s,speed,temperature\n0,7,45\n1,7,46\n')
+    assert open_drive(path, motion=file).motion.temperature is None
+    named = open_drive(path, motion=file, columns={'stamp_s': 'stamp_s',
+                                                   'temperature': 'temperature'})
+    assert named.motion.temperature.values[1] == [46.0]
+    kelvins = write(tmp_path / 'kelvins.csv', 'stamp_s,temperature\n0,293\n10,295\n')
+    for wrong, code in ((kelvins, 'E-TEMPERATURE-UNUSABLE'),
+                        (gyro_csv(tmp_path), 'E-MOTION-COLUMNS'),
+                        ('/front/warmth', 'E-TEMPERATURE-MISSING')):
+        with refused(InputError, code):
+            open_drive(path, temperature=str(wrong))
+
+
 def test_messages_without_a_stamp_have_the_time_they_came(tmp_path):
     path = write_bag(tmp_path / 'bag', [imu(n, stamp_ns=0) for n in range(20)])
     assert bag_motion([path], NONE).since(START / 1e9).rate.stamps_s[1] == pytest.approx(

@@ -21,6 +21,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.exceptions import InvalidHandle
 from rclpy.lifecycle import TransitionCallbackReturn
+from ros_bench import START
 from ros_desk import FIRST, SIGMA
 from sensor_msgs.srv import SetCameraInfo
 from std_srvs.srv import Trigger
@@ -34,7 +35,7 @@ from dashcalib_ros.detect.one_camera import OtherCamera
 from dashcalib_ros.formats import load_camera
 from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge import TurnSummary, Verdict
-from dashcalib_ros.judge.calibration import Mount
+from dashcalib_ros.judge.calibration import Drift, Mount
 from dashcalib_ros.report import Calibration
 from dashcalib_ros.ros import calibrate
 from dashcalib_ros.ros.background import Moved, Result, Trouble
@@ -62,14 +63,15 @@ def test_its_life_with_a_camera_that_is_bumped(make_desk):
     # confirmed, but no better
     desk.give(fx=401.0)
     assert desk.show() == 400.0
-    # clearly better
+    # clearly better: four times as much is known of fx
     desk.give(fx=402.0, sigma={**SIGMA, 'fx': 1.0})
-    assert desk.show() == 402.0
-    assert load_camera(desk.file).camera.fx == 402.0
+    followed = desk.show()
+    assert followed == pytest.approx(401.6, abs=1e-3)
+    assert load_camera(desk.file).camera.fx == followed
     # bumped
     for count in (1, 2):
         desk.give(complete=False, cx=350.0)
-        assert desk.show() == 402.0 and desk.bench.values['contradictions'] == str(count)
+        assert desk.show() == followed and desk.bench.values['contradictions'] == str(count)
     desk.give(complete=False, cx=350.0)
     assert desk.show() is None and desk.bench.values['state'] == 'collecting'
     desk.until(lambda: desk.bench.latched[-1].k[0] == 0)
@@ -77,6 +79,24 @@ def test_its_life_with_a_camera_that_is_bumped(make_desk):
     desk.give(fx=403.0, cx=350.0)
     assert desk.show() == 403.0
     desk.until(lambda: desk.bench.latched[-1].k[0] == 403.0)
+
+
+def test_camera_info_is_that_of_the_temperature_now(make_desk):
+    desk = make_desk(use_temperature=True)
+    drift = Drift(0.1, 0.05, 0.0, 0.05, 0.01, 20.0, 40.0)
+    desk.give(drift=drift, temperature_c=30.0)
+    assert desk.show() == 400.0
+    add = desk.drive.learner.sensors.add
+    for now_c, times in ((38.0, 1.004), (25.0, 0.9975), (55.0, 1.005), (float('nan'), 1.0)):
+        add('temperature', START / 1e9, (now_c,))
+        assert desk.show() == pytest.approx(400.0 * times)
+    # what is in use and kept stays that of its own temperature
+    assert desk.bench.latched[-1].k[0] == 400.0 and load_camera(desk.file).camera.fx == 400.0
+    add('temperature', START / 1e9 - 100, (38.0,))
+    assert desk.show() == 400.0
+    # warmer turns say what it says, and do not contradict it
+    desk.give(fx=402.0, temperature_c=40.0, sigma={**SIGMA, 'fx': 1.5})
+    assert desk.bench.values['contradictions'] == '0'
 
 
 def test_images_of_two_cameras_get_nothing(make_desk, monkeypatch):

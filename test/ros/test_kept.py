@@ -78,6 +78,16 @@ def test_what_is_kept_comes_back_whole_and_says_whose_it_is(store, model):
     assert other.text != kept.text and not again.edited and again.contradictions == 2
 
 
+def test_its_age_is_known_where_the_file_says_when_it_was_made():
+    kept = kept_of('radial')
+    assert 0 <= kept.days < 1
+    for created, days in (('2020-01-01T00:00:00+00:00', 2000), ('noon', 0), (None, 0),
+                          ('2020-01-01T00:00:00', 0)):
+        own = {**kept.content['dashcalib'], 'created': created}
+        old = dataclasses.replace(kept, content={**kept.content, 'dashcalib': own})
+        assert (old.days > days) if days else (old.days == 0)
+
+
 @pytest.mark.parametrize(('whose', 'code', 'value'), [
     (CameraIdentity('front', '/rear/image_raw'), 'E-KEPT-OF-OTHER-TOPIC', '/front/image_raw'),
     (CameraIdentity('rear', '/front/image_raw'), 'E-KEPT-OF-OTHER-CAMERA', 'camera front')])

@@ -16,7 +16,7 @@ from made_calibration import make_calibration
 from nav_msgs.msg import Odometry
 from ros_bench import keep_file
 from scipy.spatial.transform import Rotation
-from sensor_msgs.msg import Imu, NavSatFix
+from sensor_msgs.msg import Imu, NavSatFix, Temperature
 from std_msgs.msg import Header
 
 from dashcalib_ros.input.motion import SensorBuffer
@@ -243,6 +243,18 @@ def test_sensors_are_kept_as_streams(names):
     assert found.rate.values[-1, 1] == pytest.approx(1.29) and found.speed.values[0, 0] == 3.0
     assert found.position.values[-1, 1] == pytest.approx(29 * 1.1132, rel=1e-3)
     assert len(found.position.stamps_s) == 30
+
+
+def test_a_temperature_is_kept_with_the_sensors():
+    node, buffer = FakeEndpoints(None, None, None, {}), SensorBuffer()
+    subscribe_sensors(node, NodeConfig(use_temperature=True), buffer.add)
+    for second in range(100, 110):
+        message = stamped(Temperature, second)
+        message.temperature = 0.5 * second
+        node.heard['temperature'](message)
+    assert buffer.newest('temperature') == (109.0, (54.5,)) and buffer.newest('rate') is None
+    found = buffer.stream().temperature
+    assert found.values[0, 0] == 50.0 and len(found.values) == 10
 
 
 def test_sensors_that_are_not_named_are_not_listened_to():

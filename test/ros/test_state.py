@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import numpy as np
 import pytest
 
 from dashcalib_ros.camera import Brown, Fisheye, Radial
@@ -11,13 +12,14 @@ from dashcalib_ros.camera.mapping import as_model
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import Notice
 from dashcalib_ros.judge import Verdict
+from dashcalib_ros.judge.calibration import Drift
 from dashcalib_ros.judge.difference import contradicted
 from dashcalib_ros.judge.verdict import MOVES, STEADY
 from dashcalib_ros.report import Calibration, NamedCamera
 from dashcalib_ros.ros.settings import NodeConfig
 from dashcalib_ros.ros.state import judge, sigma_text
 
-RULES = NodeConfig(better=0.7, contradictions=3)
+RULES = NodeConfig(contradictions=3)
 TRUTH = Radial((640, 360), 400.0, 401.0, 320.0, 180.0, -0.3, 0.1)
 SIGMA = {'fx': 2.0, 'fy': 2.0, 'cx': 2.0, 'cy': 2.0, 'k1': 0.01, 'k2': 0.01}
 OLD = NamedCamera('old', TRUTH, SIGMA, 'accepted')
@@ -43,12 +45,66 @@ def test_one_that_is_not_accepted_changes_nothing():
     assert (judged.action, judged.contradictions) == ('keep', 2)
 
 
-@pytest.mark.parametrize(('ratio', 'action'), [(0.69, 'replace'), (0.71, 'keep'), (1.5, 'keep')])
-def test_a_confirming_one_replaces_it_only_when_clearly_better(ratio, action):
+@pytest.mark.parametrize(('ratio', 'fx', 'action'), [
+    (0.69, 400.0, 'follow'), (0.71, 400.0, 'keep'), (1.5, 400.0, 'keep'),
+    (1.0, 401.9, 'keep'), (1.0, 402.1, 'follow'), (3.0, 406.0, 'keep'), (3.0, 411.0, 'follow')])
+def test_a_confirming_one_is_followed_where_that_changes_something(ratio, fx, action):
     sigma = {**SIGMA, 'fx': ratio * SIGMA['fx']}
-    assert judge(calibration(sigma=sigma), True, OLD, 0, RULES).action == action
-    # too few turns to replace anything
-    assert judge(calibration(sigma=sigma), False, OLD, 0, RULES).action == 'keep'
+    judged = judge(calibration(sigma=sigma, fx=fx), True, OLD, 0, RULES)
+    assert judged.action == action and judged.confirmed
+    # too few turns to follow
+    judged = judge(calibration(sigma=sigma, fx=fx), False, OLD, 0, RULES)
+    assert judged.action == 'keep' and judged.confirmed
+
+
+def test_the_share_of_each_is_what_it_knows_of_fx():
+    sigma = {**SIGMA, 'fx': 1.0, 'k1': 0.02}
+    found = judge(calibration(sigma=sigma, fx=402.0, k1=-0.25), True, OLD, 0, RULES).calibration
+    assert found.camera.fx == pytest.approx(401.6) and found.camera.k1 == pytest.approx(-0.26)
+    # between both, whatever they have in common
+    assert found.sigma['fx']**2 == pytest.approx(0.2 * 4.0 + 0.8)
+    assert found.sigma['k1']**2 == pytest.approx(0.2 * 1e-4 + 0.8 * 4e-4)
+    assert found.covariance is None and found.picture_covariance is None
+    # after a year the old one says little
+    later = judge(calibration(fx=406.0), True, OLD, 0, RULES, 365.0).calibration
+    assert later.camera.fx == pytest.approx(404.94, abs=0.01)
+    assert judge(calibration(fx=412.0), True, OLD, 0, RULES).contradictions == 1
+    for days in (365.0, 1e9):
+        assert judge(calibration(fx=412.0), True, OLD, 0, RULES, days).action == 'follow'
+        assert judge(calibration(fx=440.0), True, OLD, 0, RULES, days).contradictions == 1
+    # a clock that was set back
+    assert judge(calibration(fx=412.0), True, OLD, 0, RULES, -1e9).contradictions == 1
+
+
+@pytest.mark.parametrize(('percent', 'spread'), [(0.0, 0.3), (0.5, 0.3), (0.5, 0.1), (1.0, 0.3)])
+def test_a_lens_that_drifts_over_ten_drives_is_followed_and_not_contradicted(percent, spread):
+    rng, against, right = np.random.default_rng(0), 0, []
+    own = {**SIGMA, 'fx': spread * 4.0, 'fy': spread * 4.0}
+    for _ in range(100):
+        camera, count = dataclasses.replace(TRUTH, fx=400.0 + rng.normal(0, own['fx'])), 0
+        published, days = NamedCamera('old', camera, own, 'accepted'), 0.0
+        for drive in range(1, 11):
+            days, truth = days + 1, 400.0 * (1 + percent / 1000 * drive)
+            judged = judge(calibration(sigma=own, fx=truth + rng.normal(0, own['fx'])), True,
+                           published, count, RULES, days)
+            against, count = against + (not judged.confirmed), judged.contradictions
+            if judged.calibration is not None:
+                found, days = judged.calibration, 0.0
+                published = NamedCamera('new', found.camera, found.sigma, 'accepted')
+        right.append(abs(published.camera.fx - truth) < 2 * published.sigma['fx'])
+    assert np.mean(right) >= 0.95 and against <= 4
+
+
+def test_it_keeps_what_it_knows_of_the_temperature():
+    drift = Drift(0.1, 0.05, 0.0, 0.05, 0.01, 20.0, 40.0)
+    old = dataclasses.replace(OLD, drift=drift, temperature_c=30.0)
+    warm = dataclasses.replace(calibration(fx=407.0), temperature_c=40.0)
+    found = judge(warm, True, old, 0, RULES).calibration
+    # 400 at 30 degrees is 402 at 40
+    assert found.camera.fx == pytest.approx(404.5)
+    assert (found.drift, found.temperature_c) == (drift, 40.0)
+    found = judge(calibration(fx=405.0), True, old, 0, RULES).calibration
+    assert (found.drift, found.temperature_c) == (drift, 30.0)
 
 
 def test_contradictions_in_a_row_give_it_up():
@@ -99,7 +155,7 @@ def test_the_same_lens_in_another_model_confirms(model):
     assert not contradicted(old.camera, old.sigma, other, tiny)
     assert contradicted(old.camera, old.sigma, dataclasses.replace(other, fx=other.fx + 10), tiny)
     new = dataclasses.replace(calibration(), camera=other, sigma=tiny)
-    assert judge(new, True, old, 0, RULES).action == 'replace'
+    assert judge(new, True, old, 0, RULES).action == 'follow'
     assert judge(calibration(), True, NamedCamera('old', as_model(TRUTH, model), dict.fromkeys(
         other.names(), 2.0), 'accepted'), 0, RULES).action == 'keep'
 

@@ -10,10 +10,14 @@ import pytest
 from solving import CONFIG, scenes_of, solved
 from synthetic import LENS, SIZE
 
+from dashcalib_ros.input.motion import Samples
+from dashcalib_ros.input.scale import FULL_SIZE
+from dashcalib_ros.judge import CalibrationData
+from dashcalib_ros.judge.conclude import Evidence, conclude
 from dashcalib_ros.judge.verdict import judge
-from dashcalib_ros.problem.blocks import Drift
+from dashcalib_ros.problem.blocks import Drift, Warmth
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.solve.solution import FocalDrift, with_measurement
+from dashcalib_ros.solve.solution import FocalDrift, Solution, with_measurement
 
 pytestmark = pytest.mark.usefixtures('no_profile')
 
@@ -61,6 +65,65 @@ def test_what_is_known_of_a_drift_moves_it():
 
 def test_a_steady_lens_has_no_drift():
     assert solved(warming(0.0)).drift is None
+
+
+def concluded(solution: Solution, warmth: Samples) -> CalibrationData:
+    """Return the result of a drive with a temperature."""
+    return conclude(solution, Evidence(SIZE, 300, (), {}, np.zeros((0, 2)), None, FULL_SIZE, {},
+                                       temperature=warmth), CONFIG)
+
+
+# of turns, a minute apart, degrees Celsius: it warms up, and cools down again
+WARMTH = (20.0, 32.0, 38.0, 30.0, 22.0)
+
+
+def temperature(degrees: Sequence[float]) -> Samples:
+    """Return the temperature of such turns."""
+    start_s = scenes_of(1, tracks=150)[0].tracks.stamps_ns[0] / 1e9
+    return Samples(start_s + np.array([0.0, 60, 120, 180, 245]), np.array(degrees)[:, None])
+
+
+def test_a_lens_that_follows_the_temperature_is_measured_by_kelvin():
+    size = 0.001
+    scenes = zoomed([1 + size * (each - np.mean(WARMTH)) for each in WARMTH])
+    solution = solved(scenes, temperature=temperature(WARMTH))
+    drift = solution.drift
+    assert drift is not None and drift.of_kelvin is not None and drift.linear
+    value, sigma = drift.of_kelvin
+    assert abs(value - size) < 3 * sigma < 0.6 * abs(size)
+    assert drift.largest > 3 * abs(drift.size)
+    for turn, each in enumerate(WARMTH):
+        camera, off = solution.at(turn * 60 * 10**9 + 10**9)
+        assert abs(camera.fx - LENS.fx * (1 + size * (each - np.mean(WARMTH)))) < 3 * off[0]
+    found = concluded(solution, temperature(WARMTH))
+    assert found.drift is not None and found.drift.fx_percent_per_kelvin == 100 * value
+    assert found.drift.sigma_per_kelvin == 100 * sigma and found.drift.to_c is not None
+    assert found.temperature_c is not None and 28 < found.temperature_c < 29
+    # one that was measured on another day
+    later = replace(temperature(WARMTH), stamps_s=temperature(WARMTH).stamps_s + 86400)
+    other = concluded(solved(warming(0.0, 2), temperature=later), later)
+    assert other.temperature_c is None and other.drift is None
+    assert 'E-TEMPERATURE-TIMES' in {each.code for each in other.warnings}
+
+
+def test_what_grows_with_time_and_not_with_the_temperature_has_no_size_per_kelvin():
+    found = solved(warming(0.02), temperature=temperature(WARMTH)).drift
+    assert found is not None and found.linear and found.of_kelvin is None
+    assert solved(warming(0.0), temperature=temperature(WARMTH)).drift is None
+
+
+def test_a_temperature_that_stays_is_not_followed():
+    found = solved(warming(0.02), temperature=temperature([20.0, 20.5, 21.0, 20.5, 20.0])).drift
+    assert found is not None and found.of_kelvin is None
+
+
+def test_a_temperature_of_other_times_is_none():
+    turns_ns = [scene.tracks.stamps_ns for scene in warming(0.0)]
+    samples = temperature(WARMTH)
+    found = Warmth.over(samples, turns_ns)
+    assert found is not None and 20 <= found.coldest_c < 21 and 37 < found.warmest_c <= 38
+    assert Warmth.over(replace(samples, stamps_s=samples.stamps_s + 1000), turns_ns) is None
+    assert Warmth.over(None, turns_ns) is None
 
 
 def test_two_turns_cannot_tell():
