@@ -19,7 +19,7 @@ from dashcalib_ros.errors import InputError, Notice, counted, spared
 from dashcalib_ros.formats import result_json
 from dashcalib_ros.formats.ours import codes_of
 from dashcalib_ros.input import FrameSource
-from dashcalib_ros.pipeline import Outlook
+from dashcalib_ros.judge.conclude import Outlook
 from dashcalib_ros.report import Calibration, Written, output_folder, write_results
 from dashcalib_ros.report.tables import (
     TextTable,

@@ -242,7 +242,7 @@ def gather(path: Path, content: str, fps: float | None, topic: str | None, confi
     content: the clip's content_hash(). Raises InputError for what cannot be read, and for the
     images of two cameras.
     """
-    source = open_frames(path, topic, fps)
+    source = open_frames(path, topic=topic, fps=fps)
     detection = detect(source, config, keep=in_a_file)
     if detection.other_camera is not None:
         raise InputError('E-TWO-CAMERAS', f'{detection.other_camera}: {APART}')

@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable, Set
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 from dashcalib_ros import reconstruct
@@ -17,8 +18,17 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import Turn, TurnId
 from dashcalib_ros.errors import DashcalibError, Notice, WorkerError, coded
 from dashcalib_ros.reconstruct.scene import Draft, Scene, TurnPicture, picture_of
+from dashcalib_ros.workers.child import ChildWorker
 from dashcalib_ros.workers.memory import return_free_memory
-from dashcalib_ros.workers.worker import Progress, Worker, WorkerDiedError
+from dashcalib_ros.workers.worker import (
+    InlineWorker,
+    Progress,
+    Worker,
+    WorkerDiedError,
+    load_all,
+    load_judging,
+    load_solving,
+)
 
 # if a worker dies in the same call this often, seconds apart, the call may be the cause
 ATTEMPTS = 5
@@ -126,11 +136,6 @@ class ScenePool:
                 del self._scenes[turn]
                 self._pictures.pop(turn, None)
 
-    def reject(self, turn: TurnId) -> None:
-        """Take out a scene that does not fit the others; its turn counts as one without."""
-        with self._changed:
-            self._scenes[turn] = None
-
     def unbuilt(self) -> frozenset[TurnId]:
         """Return the turns that are not done yet."""
         with self._changed:
@@ -160,6 +165,23 @@ class ScenePool:
             return until()
 
         self._wait(ended)
+
+    def wait_for_turns(self, progress: Progress, enough: Callable[[], bool]) -> None:
+        """Wait until all turns are done, or these are enough; raises as wait() does.
+
+        progress: called with the stage and the share done. Raises WorkerError when closed.
+        """
+        total = max(len(self.unbuilt()), 1)
+
+        def ready() -> bool:
+            waiting = len(self.unbuilt())
+            progress('reconstructing turns', max(0.0, 1 - waiting / total))
+            return not waiting or enough()
+
+        self.wait(ready)
+        if self.closed:
+            raise WorkerError('E-CALIBRATOR-CLOSED',
+                              'the calibrator was closed while it calibrated')
 
     # other functions --------------------------------------------------------------------------
 
@@ -380,3 +402,18 @@ class ScenePool:
     def _notify(self) -> None:
         self._changes += 1
         self._changed.notify_all()
+
+
+def pool_of(config: Config, live: bool, verbose: bool, inline: bool,
+            on_lost: Callable[[Notice], None], on_trouble: Callable[[str], None],
+            on_wait: Callable[[], bool] | None) -> ScenePool:
+    """Return the pool of a Calibrator, whose parameters these are; on_lost: as the pool's."""
+    if live:
+        # nothing else runs during an import: while images come, some would be lost
+        load_judging()
+    return ScenePool(
+        config, InlineWorker if inline else partial(
+            ChildWorker, live, verbose, config.threads, on_trouble),
+        partial(load_all if live else load_solving, config.reconstruct.used),
+        queue=config.turns.wanted if live else None, on_lost=on_lost, on_trouble=on_trouble,
+        keep_pictures=not live, on_wait=on_wait)

@@ -11,6 +11,7 @@ import re
 import shutil
 import signal
 import sys
+import types
 from typing import ClassVar
 from unittest.mock import create_autospec
 
@@ -34,8 +35,10 @@ from dashcalib_ros.demo import Drive, Lens, demo_drive, render_to_bag
 from dashcalib_ros.detect.turn import Turn, TurnId
 from dashcalib_ros.errors import ConfigError, Notice, OutputError, WorkerError
 from dashcalib_ros.judge import Verdict
-from dashcalib_ros.pipeline import Calibrator, Outlook, Status
+from dashcalib_ros.judge.conclude import Outlook
+from dashcalib_ros.pipeline import Calibrator
 from dashcalib_ros.report import write_results
+from dashcalib_ros.selection import Status
 
 NAMES_OF_MODELS = [AUTO, *(model.model for model in calibrated_models())]
 
@@ -65,8 +68,9 @@ class FakeCalibrator:
         return Status(frames=self.frames, turns=self.frames // 2, built=0, yaw_deg=0.0,
                       magnitude=0.0, standing=False)
 
-    def turns(self):
-        return self.found
+    @property
+    def detection(self):
+        return types.SimpleNamespace(turns=lambda: self.found)
 
     def calibrate(self, progress=None):
         progress('reconstructing', 0.5)

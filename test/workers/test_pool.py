@@ -194,8 +194,6 @@ def test_scenes_of_turns_that_left_are_dropped(pool, monkeypatch, tmp_path):
     wait_for((tmp_path / 'flag.90').exists)
     pool.keep_only({at(50)})
     assert len(pool.unbuilt()) == 0
-    pool.reject(at(50))
-    assert pool.scenes() == {at(50): None}
 
 
 def test_the_most_prominent_is_built_first_and_the_queue_has_an_end(monkeypatch, tmp_path):
