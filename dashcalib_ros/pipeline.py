@@ -70,7 +70,7 @@ class Calibrator(AbstractContextManager['Calibrator']):
         config, mask = Config.of(config), mask_of(mask)
         searched(config.model)
         self.solution: Solution | None = None
-        self._live, self._threads = live, config.threads
+        self._live, self._workers = live, config.workers
         self._motion: SensorStream | None = None
         # what the calibration under way has to do without, and what it has from earlier drives
         self._lost: list[Notice] = []
@@ -99,7 +99,7 @@ class Calibrator(AbstractContextManager['Calibrator']):
             self._carry_out(self.scenes.stretch_plan())
         else:
             # one beside those that the workers have: the detection goes on, and none of them idles
-            self.workers.wait(lambda: len(self.workers.unbuilt()) <= self._threads + 1)
+            self.workers.wait(lambda: len(self.workers.unbuilt()) <= self._workers + 1)
         return self.status()
 
     def sense(self, motion: SensorStream) -> None:

@@ -175,7 +175,7 @@ def test_two_threads_and_a_child_that_is_killed_change_nothing(frames, result):
                     killed.append(pid)
 
     ended = threading.Event()
-    with limited(Calibrator(QUICK.replace({'threads': 2}))) as calibrator:
+    with limited(Calibrator(QUICK.replace({'workers': 2}))) as calibrator:
         thread = threading.Thread(target=assassin, args=(calibrator, ended), daemon=True)
         thread.start()
         try:

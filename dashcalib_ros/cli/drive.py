@@ -16,7 +16,7 @@ from dashcalib_ros.session import Recording
 
 # --turns sets both, so that exactly this number of turns is used
 FLAGS = {'turns': ('turns.wanted', 'turns.at_most'), 'thorough': ('turns.thorough',),
-         'seed': ('seed',), 'threads': ('threads',),
+         'seed': ('seed',), 'workers': ('workers',),
          'segmentation': ('mask.segmentation',), 'model': ('model',),
          'speed': ('mount.speed_kmh',), 'mount': ('mount.enabled',),
          'gyro_scale_sigma': ('motion.gyro_scale_sigma',)}

@@ -39,7 +39,7 @@ from dashcalib_ros.workers.memory import in_a_file
 
 # settings by which a clip's scenes do not change
 LATER = ('intrinsics.', 'verdict.', 'fleet.', 'known.')
-LATER_NAMES = ('threads', 'rectified', 'turns.store')
+LATER_NAMES = ('workers', 'rectified', 'turns.store')
 GONE = InputError('E-CLIP-MISSING', 'there is no such file; check the path')
 # what is gathered of a clip; 2: its upright lines, too; 3: other stretches than turns
 GATHERED = 3

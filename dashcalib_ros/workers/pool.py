@@ -72,7 +72,7 @@ def back_off_s(failures: int) -> float:
 
 
 class ScenePool:
-    """Reconstructs turns in the background, by config.threads workers, and runs other functions.
+    """Reconstructs turns in the background, by config.workers workers, and runs other functions.
 
     A turn takes two calls, its draft and its scene; other calls may run in between. A call whose
     worker dies is tried again after a while; so is a turn's that raises. Only a call in which
@@ -105,7 +105,7 @@ class ScenePool:
         self._queue = queue
         self._keep_pictures = keep_pictures
         self._on_lost, self._on_trouble, self._on_wait = on_lost, on_trouble, on_wait
-        self._workers = tuple(make_worker() for _ in range(config.threads))
+        self._workers = tuple(make_worker() for _ in range(config.workers))
         self._closed = threading.Event()
         self._threads: list[threading.Thread] = []
         # guards all that follows; held only briefly
@@ -413,7 +413,7 @@ def pool_of(config: Config, live: bool, verbose: bool, inline: bool,
         load_judging()
     return ScenePool(
         config, InlineWorker if inline else partial(
-            ChildWorker, live, verbose, config.threads, on_trouble),
+            ChildWorker, live, verbose, config.workers, on_trouble),
         partial(load_all if live else load_solving, config.reconstruct.used),
         queue=config.turns.wanted if live else None, on_lost=on_lost, on_trouble=on_trouble,
         keep_pictures=not live, on_wait=on_wait)

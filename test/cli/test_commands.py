@@ -209,10 +209,13 @@ def test_flags_win_over_set_which_wins_over_the_file(fake, drive, tmp_path):
     path = tmp_path / 'config.yaml'
     path.write_text('turns:\n  wanted: 2\n  half_width: 2\nseed: 3\nmotion.standing_px: 2e-1\n')
     assert main(['run', drive, '--config', str(path), '--set', 'turns.wanted=3', '--set',
-                 'turns.half_width=1e0', '--turns', '4', '--threads', '2', '--verbose']) == 0
+                 'turns.half_width=1e0', '--turns', '4', '--workers', '2', '--verbose']) == 0
     wanted = Config().replace({'turns.wanted': 4, 'turns.at_most': 4, 'turns.half_width': 1.0,
-                               'seed': 3, 'motion.standing_px': 0.2, 'threads': 2})
+                               'seed': 3, 'motion.standing_px': 0.2, 'workers': 2})
     assert fake.made[0].config == wanted and fake.made[0].verbose
+    # its earlier name
+    assert main(['run', drive, '--threads', '3']) == 0
+    assert fake.made[1].config.workers == 3
 
 
 @pytest.mark.parametrize('model', NAMES_OF_MODELS)

@@ -107,6 +107,12 @@ def read(arguments):
         rclpy.shutdown()
 
 
+def test_a_parameter_may_have_its_earlier_name(ros_context):
+    with pytest.warns(FutureWarning, match='workers'):
+        settings, names = read(['-p', 'threads:=3'])
+    assert settings.core.workers == 3 and 'workers' in names and 'threads' not in names
+
+
 def test_a_file_may_have_full_names_or_sections(tmp_path, ros_context):
     path = tmp_path / 'parameters.yaml'
     path.write_text('/**:\n  ros__parameters:\n    turns.wanted: 3\n    motion.rate: 8.0\n'

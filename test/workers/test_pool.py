@@ -47,7 +47,7 @@ def trouble() -> list[str]:
 def make_pool(threads: int = 2, make_worker: Callable[[], Worker] = ChildWorker,
               load: Callable[[], object] = child_tasks.pid, **options: Any) -> ScenePool:
     """Make a pool whose workers load nothing large."""
-    return ScenePool(Config().replace({'threads': threads}), make_worker, load, **options)
+    return ScenePool(Config().replace({'workers': threads}), make_worker, load, **options)
 
 
 @pytest.fixture
