@@ -15,15 +15,8 @@ from dashcalib_ros.errors import Notice, spared
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.decode import mask_of
 from dashcalib_ros.input.motion import SensorStream
-from dashcalib_ros.judge.agreement import contradicting_turns, turns_of_earlier_cameras
-from dashcalib_ros.judge.conclude import (
-    Evidence,
-    Outlook,
-    conclude,
-    evidence_of_detection,
-    outlook,
-    turns_that_stood,
-)
+from dashcalib_ros.judge import agreement
+from dashcalib_ros.judge.conclude import Evidence, conclude, evidence_of_detection
 from dashcalib_ros.judge.witnesses import SensorComparison, compare_sensors
 from dashcalib_ros.reconstruct.repeated import without_repeated
 from dashcalib_ros.reconstruct.scene import Scene
@@ -34,7 +27,7 @@ from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.store.scene_file import StoredTurn
 from dashcalib_ros.workers.memory import in_a_file
 from dashcalib_ros.workers.pool import pool_of
-from dashcalib_ros.workers.worker import Progress, WorkerDiedError
+from dashcalib_ros.workers.worker import Progress
 
 
 class Calibrator(AbstractContextManager['Calibrator']):
@@ -76,13 +69,8 @@ class Calibrator(AbstractContextManager['Calibrator']):
         self._lost: list[Notice] = []
         self._stored: tuple[StoredTurn, ...] = ()
         self._detect_s, self._started = 0.0, time.monotonic()
-
-        def lost(notice: Notice) -> None:
-            self.scenes.warnings.append(notice)
-            on_trouble(notice)
-
         self.detection = Detection(config, mask, beside=not live, keep=None if live else in_a_file)
-        self.workers = pool_of(config, live, verbose, inline, lost, on_trouble, on_wait)
+        self.workers = pool_of(config, live, verbose, inline, on_trouble, on_wait)
         self.scenes = SceneSelection(config, self.detection, self.workers, live, use_stored, warn)
 
     def push(self, frame: Frame) -> Status:
@@ -123,16 +111,6 @@ class Calibrator(AbstractContextManager['Calibrator']):
             found = self._calibrate(progress, final, started)  # with more turns
         return found
 
-    def outlook(self, progress: Progress | None = None) -> Outlook:
-        """Reconstruct the best turns, as calibrate() does, and say whether they are enough.
-
-        The drive is over: no push() may follow.
-        """
-        self.detection.finish()
-        scenes = self.reconstruct(progress or (lambda stage, done: None), final=True)
-        return outlook(scenes, self._evidence(time.monotonic(), SensorComparison()),
-                       self.scenes.config.verdict)
-
     def status(self) -> Status:
         """Return the present state; scenes that are new are written to turns.store."""
         return self.scenes.status()
@@ -154,7 +132,7 @@ class Calibrator(AbstractContextManager['Calibrator']):
             self.detection.set_aside(turn)
 
     def reconstruct(self, progress: Progress, final: bool) -> list[Scene]:
-        """Wait for the best turns' scenes and return them, the best first; as calibrate() does."""
+        """Wait for the best turns' scenes and return them, the best first, as calibrate() does."""
         # all turns, also those that are not used: the report must not depend on the workers' speed
         everything = final or not self._live
         while True:
@@ -169,13 +147,19 @@ class Calibrator(AbstractContextManager['Calibrator']):
     def _calibrate(self, progress: Progress, final: bool, started: float) -> Calibration:
         self._lost, config = [], self.scenes.config
         scenes, solution = self._solve(config, progress, final)  # scenes -> one camera
-        sensors = self._compare_sensors(solution, config, progress)
+        sensors = SensorComparison(solution)
+        if self._motion is not None:
+            progress('evaluating the motion sensors', 0.0)
+            sensors = spared('the comparison with the motion sensors', self._lost,
+                             self.workers.run, compare_sensors, solution, self._motion,
+                             self.detection.start_s, config) or sensors
+            self.workers.check_open()
         self.solution = solution = sensors.solution
         # these do not count in the next calibration; files of another camera's turns stay
-        self.scenes.exclude(turns_of_earlier_cameras(scenes, solution), keep_files=True)
-        self.scenes.exclude(contradicting_turns(scenes, solution))
+        self.scenes.exclude(agreement.turns_of_earlier_cameras(scenes, solution), keep_files=True)
+        self.scenes.exclude(agreement.contradicting_turns(scenes, solution))
         # one camera -> verdict; the solution itself is judged
-        what = solution, self._evidence(started, replace(sensors, solution=None)), config
+        what = solution, self.evidence(started, replace(sensors, solution=None)), config
         # it takes a second or two, and a live drive goes on meanwhile
         return Calibration.of(conclude(*what) if not self._live or solution is None
                               else self.workers.run(conclude, *what))
@@ -183,8 +167,9 @@ class Calibrator(AbstractContextManager['Calibrator']):
     def _solve(self, config: Config, progress: Progress, final: bool
                ) -> tuple[list[Scene], Solution | None]:
         while scenes := self.reconstruct(progress, final):
-            stood = spared('what the speed says of the turns', self._lost, turns_that_stood,
-                           scenes, self._motion, self.detection.start_s)
+            stood = spared('what the speed says of the turns', self._lost,
+                           agreement.turns_that_stood, scenes, self._motion,
+                           self.detection.start_s)
             if stood:
                 self.scenes.exclude(stood)
                 continue
@@ -203,25 +188,14 @@ class Calibrator(AbstractContextManager['Calibrator']):
             return kept, self.workers.result(solving, progress)
         return [], None
 
-    def _compare_sensors(self, solution: Solution | None, config: Config, progress: Progress
-                         ) -> SensorComparison:
-        found: SensorComparison | None = None
-        if self._motion is not None:
-            progress('evaluating the motion sensors', 0.0)
-            found = spared(
-                'the comparison with the motion sensors', self._lost, self.workers.run,
-                compare_sensors, solution, self._motion, self.detection.start_s, config)
-            if self.workers.closed:
-                raise WorkerDiedError('E-CALIBRATOR-CLOSED', 'the calibrator is closed')
-        return found or SensorComparison(solution)
-
-    def _evidence(self, started: float, sensors: SensorComparison) -> Evidence:
+    def evidence(self, started: float, sensors: SensorComparison) -> Evidence:
+        """Return what a result needs beside the solution. started: s of time.monotonic()."""
         now = time.monotonic()
         seen = evidence_of_detection(self.detection, self.scenes.built().values())
         return replace(
             seen, timing={'detect': self._detect_s, 'calibrate': now - started,
                           'total': now - self._started},
-            warnings=(*seen.warnings, *self.scenes.warnings, *self._lost),
+            warnings=(*seen.warnings, *self.scenes.warnings, *self.workers.lost, *self._lost),
             stored=self._stored, left_out=self.scenes.left_out(),
             pictures=None if self._live else self.workers.pictures(), motion=self._motion,
             sensors=sensors)

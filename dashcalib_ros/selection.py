@@ -76,7 +76,7 @@ class SceneSelection:
 
     It only looks at the detection and the workers: the Calibrator carries out what it plans.
     config: turns.wanted is what want() was called with last. warnings: about turns.store, and
-    about turns that ended the workers. All methods are for the Calibrator's thread.
+    about turns that repeat others. All methods are for the Calibrator's thread.
     """
 
     def __init__(self, config: Config, detection: Detection, workers: ScenePool,

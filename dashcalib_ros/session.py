@@ -29,7 +29,8 @@ from dashcalib_ros.input.poses import Poses, track_poses
 from dashcalib_ros.input.source import size_text
 from dashcalib_ros.judge import Check, Odometry
 from dashcalib_ros.judge.calibration import Material
-from dashcalib_ros.judge.conclude import Outlook
+from dashcalib_ros.judge.conclude import Outlook, outlook
+from dashcalib_ros.judge.witnesses import SensorComparison
 from dashcalib_ros.limits import path_of
 from dashcalib_ros.pipeline import Calibrator
 from dashcalib_ros.report import Calibration, NamedCamera
@@ -121,7 +122,10 @@ def outlook_of(drive: Recording, config: Config | None = None,
     """Find the turns of a recorded drive, and say whether they are enough for a calibration."""
     observer = observer or Observer()
     with learned_drive(drive, config, observer, False) as calibrator:
-        return calibrator.outlook(observer.show)
+        calibrator.detection.finish()
+        scenes = calibrator.reconstruct(observer.show, final=True)
+        evidence = calibrator.evidence(time.monotonic(), SensorComparison())
+        return outlook(scenes, evidence, calibrator.scenes.config.verdict)
 
 
 def check_drive(drive: Recording, named: NamedCamera, config: Config | None = None,

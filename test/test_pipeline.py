@@ -34,8 +34,8 @@ from dashcalib_ros.detect.one_camera import OtherCamera
 from dashcalib_ros.errors import InputError, WorkerError
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.motion import Samples, SensorStream
-from dashcalib_ros.judge.agreement import OTHER_CAMERA
-from dashcalib_ros.judge.conclude import STOOD, conclude, evidence_of_detection
+from dashcalib_ros.judge.agreement import OTHER_CAMERA, STOOD
+from dashcalib_ros.judge.conclude import conclude, evidence_of_detection
 from dashcalib_ros.pipeline import Calibrator
 from dashcalib_ros.reconstruct import reconstruct
 from dashcalib_ros.reconstruct.scene import Scene
@@ -294,7 +294,7 @@ def test_what_fails_beside_the_solution_costs_itself_only(frames, monkeypatch):
         sound = calibrator.calibrate()
         calibrator.sense(SensorStream(rate=Samples(np.arange(9.0), np.zeros((9, 3)))))
         for part in ('detect.detection.Detection.lines', 'detect.detection.Detection.straights',
-                     'pipeline.turns_that_stood'):
+                     'judge.agreement.turns_that_stood'):
             monkeypatch.setattr(f'dashcalib_ros.{part}', broken)
         # in the child it raises
         monkeypatch.setattr('dashcalib_ros.pipeline.compare_sensors', child_tasks.fail)

@@ -22,7 +22,7 @@ from dashcalib_ros.detect.turn import Turn, TurnId, is_turn
 from dashcalib_ros.errors import Notice, counted, spared
 from dashcalib_ros.input.motion import SensorStream, speeds_of
 from dashcalib_ros.input.scale import Scale
-from dashcalib_ros.judge.agreement import CONTRADICTS, focal_disagreement
+from dashcalib_ros.judge.agreement import CONTRADICTS, STOOD, focal_disagreement
 from dashcalib_ros.judge.calibration import (
     CalibrationData,
     CameraAt,
@@ -59,7 +59,6 @@ from dashcalib_ros.store.scene_file import StoredTurn
 
 # why turns are not used
 NOT_NEEDED = 'more prominent turns were enough'
-STOOD = ('according to its speed the car stood: other things turned, or the camera alone')
 
 
 @dataclass(frozen=True)
@@ -113,17 +112,6 @@ def evidence_of_detection(detection: Detection, scenes: Iterable[Scene | None] =
         warnings=(*(each for each in detection.warnings() if each.code != 'E-TWO-CAMERAS'),
                   *lost),
         other_camera=other, start_s=detection.start_s, lines=lines, straights=straights)
-
-
-def turns_that_stood(scenes: Sequence[Scene], motion: SensorStream | None, start_s: float
-                     ) -> dict[TurnId, str]:
-    """Return the turns of this drive during which the car stood, as its speed says.
-
-    start_s: stamp of the drive's first image.
-    """
-    stream = (motion or SensorStream()).since(start_s)
-    return {scene.turn: STOOD for scene in scenes if scene.turn.of_this_drive
-            and stream.stood(*(scene.tracks.stamps_ns[[0, -1]] / 1e9 - start_s))}
 
 
 def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> CalibrationData:

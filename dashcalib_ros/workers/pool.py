@@ -80,13 +80,13 @@ class ScenePool:
     without a scene.
 
     Each worker has a thread of the pool. All methods may be called from any thread; only wait(),
-    run() and result() wait for workers. The pool's threads call on_lost and on_trouble, which
-    must not raise.
+    run() and result() wait for workers. The pool's threads call on_trouble, which must not raise.
+
+    lost: a line for each turn that was given up.
     """
 
     def __init__(self, config: Config, make_worker: Callable[[], Worker],
                  load: Callable[[], object], queue: int | None = None,
-                 on_lost: Callable[[Notice], None] = lambda notice: None,
                  on_trouble: Callable[[str], None] = lambda text: None,
                  keep_pictures: bool = False,
                  on_wait: Callable[[], bool] | None = None) -> None:
@@ -94,8 +94,8 @@ class ScenePool:
 
         queue: how many turns may wait for a worker, with their images; None: any number. If there
         are more, as in a live drive, the least prominent counts as one without a scene.
-        on_lost: called with a line when a turn is given up. on_trouble: called with a line when a
-        worker failed and its work is tried again.
+        on_trouble: called with a line when a worker failed and its work is tried again, and when
+        a turn is given up.
         keep_pictures: pictures() has one of each turn that is done. on_wait: called again and
         again, in the thread that waits, while wait(), run() or result() waits; returns whether it
         did something, and is called again at once then.
@@ -104,7 +104,8 @@ class ScenePool:
         self._load = load
         self._queue = queue
         self._keep_pictures = keep_pictures
-        self._on_lost, self._on_trouble, self._on_wait = on_lost, on_trouble, on_wait
+        self.lost: list[Notice] = []
+        self._on_trouble, self._on_wait = on_trouble, on_wait
         self._workers = tuple(make_worker() for _ in range(config.workers))
         self._closed = threading.Event()
         self._threads: list[threading.Thread] = []
@@ -179,9 +180,7 @@ class ScenePool:
             return not waiting or enough()
 
         self.wait(ready)
-        if self.closed:
-            raise WorkerError('E-CALIBRATOR-CLOSED',
-                              'the calibrator was closed while it calibrated')
+        self.check_open()
 
     # other functions --------------------------------------------------------------------------
 
@@ -213,8 +212,8 @@ class ScenePool:
         self._wait(ended)
         if call.done and call.error is None:
             return call.result
-        if call.error is None or self._closed.is_set():
-            raise WorkerDiedError('E-CALIBRATOR-CLOSED', 'the calibrator is closed')
+        self.check_open()
+        assert call.error is not None
         raise call.error
 
     def drop(self, call: Call) -> None:
@@ -233,10 +232,10 @@ class ScenePool:
                 for thread in self._threads:
                     thread.start()
 
-    @property
-    def closed(self) -> bool:
-        """Return whether close() was called."""
-        return self._closed.is_set()
+    def check_open(self) -> None:
+        """Raise WorkerDiedError where close() was called."""
+        if self._closed.is_set():
+            raise WorkerDiedError('E-CALIBRATOR-CLOSED', 'the calibrator is closed')
 
     def pids(self) -> list[int]:
         """Return the process ids of the workers that have one."""
@@ -332,8 +331,10 @@ class ScenePool:
         elif isinstance(error, WorkerDiedError):
             # the other turns can still be used
             self._end(call)
-            self._on_lost(Notice('E-TURN-LEFT-OUT', f'{call.turn.id} ended the reconstruction '
-                                 f'process {call.failures} times and was left out'))
+            self.lost.append(Notice(
+                'E-TURN-LEFT-OUT', f'{call.turn.id} ended the reconstruction process '
+                                   f'{call.failures} times and was left out'))
+            self._on_trouble(self.lost[-1])
         else:
             if not isinstance(error, DashcalibError):
                 error = WorkerError('E-TURN-FAILED', f'reconstruction of {call.turn.id} failed: '
@@ -405,9 +406,8 @@ class ScenePool:
 
 
 def pool_of(config: Config, live: bool, verbose: bool, inline: bool,
-            on_lost: Callable[[Notice], None], on_trouble: Callable[[str], None],
-            on_wait: Callable[[], bool] | None) -> ScenePool:
-    """Return the pool of a Calibrator, whose parameters these are; on_lost: as the pool's."""
+            on_trouble: Callable[[str], None], on_wait: Callable[[], bool] | None) -> ScenePool:
+    """Return the pool of a Calibrator, whose parameters these are."""
     if live:
         # nothing else runs during an import: while images come, some would be lost
         load_judging()
@@ -415,5 +415,5 @@ def pool_of(config: Config, live: bool, verbose: bool, inline: bool,
         config, InlineWorker if inline else partial(
             ChildWorker, live, verbose, config.workers, on_trouble),
         partial(load_all if live else load_solving, config.reconstruct.used),
-        queue=config.turns.wanted if live else None, on_lost=on_lost, on_trouble=on_trouble,
+        queue=config.turns.wanted if live else None, on_trouble=on_trouble,
         keep_pictures=not live, on_wait=on_wait)

@@ -70,7 +70,11 @@ class FakeCalibrator:
 
     @property
     def detection(self):
-        return types.SimpleNamespace(turns=lambda: self.found)
+        return types.SimpleNamespace(turns=lambda: self.found, finish=list)
+
+    @property
+    def scenes(self):
+        return types.SimpleNamespace(config=self.config)
 
     def calibrate(self, progress=None):
         progress('reconstructing', 0.5)
@@ -78,20 +82,28 @@ class FakeCalibrator:
             raise self.failure
         return make_calibration(self.level, config=self.config, warnings=(DARK,), input_name='')
 
-    def outlook(self, progress=None):
-        return Outlook(self.frames, self.found, self.yaws_deg, Verdict(
-            self.level, () if self.level == 'accepted' else
-            (Notice('E-A', 'few', 'drive'), Notice('E-B', 'less', 'park'))),
-            (), 0.0)
+    def reconstruct(self, progress, final):
+        return []
+
+    def evidence(self, started, sensors):
+        pass
 
     def close(self):
         self.closed = True
+
+    @classmethod
+    def _outlook(cls, scenes, evidence, config):
+        return Outlook(cls.made[-1].frames, cls.found, cls.yaws_deg, Verdict(
+            cls.level, () if cls.level == 'accepted' else
+            (Notice('E-A', 'few', 'drive'), Notice('E-B', 'less', 'park'))),
+            (), 0.0)
 
 
 @pytest.fixture
 def fake(monkeypatch):
     """Put the fake in the calibrator's place."""
     monkeypatch.setattr('dashcalib_ros.session.Calibrator', FakeCalibrator)
+    monkeypatch.setattr('dashcalib_ros.session.outlook', FakeCalibrator._outlook)
     monkeypatch.setattr(FakeCalibrator, 'made', [])
     return FakeCalibrator
 
