@@ -65,9 +65,8 @@ class Calibrator(AbstractContextManager['Calibrator']):
         self.solution: Solution | None = None
         self._live, self._workers = live, config.workers
         self._motion: SensorStream | None = None
-        # what the calibration under way has to do without, and what it has from earlier drives
-        self._lost: list[Notice] = []
-        self._stored: tuple[StoredTurn, ...] = ()
+        self._lost: list[Notice] = []  # what the calibration under way has to do without
+        self._stored: tuple[StoredTurn, ...] = ()  # and what it has from earlier drives
         self._detect_s, self._started = 0.0, time.monotonic()
         self.detection = Detection(config, mask, beside=not live, keep=None if live else in_a_file)
         self.workers = pool_of(config, live, verbose, inline, on_trouble, on_wait)
@@ -80,6 +79,7 @@ class Calibrator(AbstractContextManager['Calibrator']):
         if self.detection.frames == 1:
             self.scenes.load(frame.frame_id)
         if new_turns:
+            self.workers.start()
             self._carry_out(self.scenes.plan(more_to_come=True))  # in the background
         self._detect_s += time.monotonic() - started
         if self._live:
@@ -123,8 +123,6 @@ class Calibrator(AbstractContextManager['Calibrator']):
     def _carry_out(self, plan: Plan) -> None:
         if plan.keep is not None:
             self.workers.keep_only(plan.keep)
-        if plan.begin:
-            self.workers.start()
         for turn, valid in plan.build:
             self.workers.submit(turn, valid)
             self.detection.release(turn.center)
@@ -158,9 +156,8 @@ class Calibrator(AbstractContextManager['Calibrator']):
         # these do not count in the next calibration; files of another camera's turns stay
         self.scenes.exclude(agreement.turns_of_earlier_cameras(scenes, solution), keep_files=True)
         self.scenes.exclude(agreement.contradicting_turns(scenes, solution))
-        # one camera -> verdict; the solution itself is judged
         what = solution, self.evidence(started, replace(sensors, solution=None)), config
-        # it takes a second or two, and a live drive goes on meanwhile
+        # one camera -> verdict: it takes a second or two, and a live drive goes on meanwhile
         return Calibration.of(conclude(*what) if not self._live or solution is None
                               else self.workers.run(conclude, *what))
 
@@ -196,9 +193,8 @@ class Calibrator(AbstractContextManager['Calibrator']):
             seen, timing={'detect': self._detect_s, 'calibrate': now - started,
                           'total': now - self._started},
             warnings=(*seen.warnings, *self.scenes.warnings, *self.workers.lost, *self._lost),
-            stored=self._stored, left_out=self.scenes.left_out(),
-            pictures=None if self._live else self.workers.pictures(), motion=self._motion,
-            sensors=sensors)
+            stored=self._stored, left_out=self.scenes.left_out(), sensors=sensors,
+            pictures=None if self._live else self.workers.pictures(), motion=self._motion)
 
     def __exit__(self, *_: object) -> None:
         self.close()

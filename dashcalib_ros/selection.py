@@ -61,13 +61,12 @@ class Plan:
     """What is to be done with the turns of a drive.
 
     keep: the turns and stretches that still count; None: all. build: to be reconstructed, in this
-    order, each with where the ego vehicle is not; their images are released then. begin: workers
-    will be needed soon. set_aside: turns whose images wait in files.
+    order, each with where the ego vehicle is not; their images are released then. set_aside: turns
+    whose images wait in files.
     """
 
     keep: Set[TurnId] | None = None
     build: tuple[tuple[Turn, Mask | None], ...] = ()
-    begin: bool = False
     set_aside: tuple[Turn, ...] = ()
 
 
@@ -253,7 +252,7 @@ class SceneSelection:
         aside = held - self._in_a_file - {turn.id for turn in due}
         self._in_a_file |= aside
         return Plan(turns.keys(), tuple((turn, self._valid[turn.id]) for turn in due),
-                    bool(ready), tuple(turns[key] for key in aside))
+                    tuple(turns[key] for key in aside))
 
     @property
     def few(self) -> bool:
