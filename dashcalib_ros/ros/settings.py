@@ -13,7 +13,7 @@ from typing import Any
 
 import yaml
 
-from dashcalib_ros.config import Config, _check, describe, expert, setting
+from dashcalib_ros.config import RENAMED, Config, _check, describe, expert, setting
 from dashcalib_ros.errors import ConfigError, InputError
 from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
 from dashcalib_ros.ros.interface import CALIBRATOR, CHECKER, PUBLISHED, SERVICES, SUBSCRIBED
@@ -190,7 +190,8 @@ def parse(argv: Sequence[str]) -> tuple[bool, frozenset[str]]:
             of_ros = argument != '--'
             if argument in ('-p', '--param'):
                 # [NODE:]NAME:=VALUE
-                names.add(value.partition(':=')[0].rpartition(':')[2])
+                name = value.partition(':=')[0].rpartition(':')[2]
+                names.add(RENAMED.get(name, name))
         elif argument in ('-h', '--help'):
             wants_help = True
         else:
