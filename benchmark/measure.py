@@ -228,7 +228,7 @@ def calibrate(frames: Iterable[Frame], config: Config) -> tuple[CalibrationData,
 
 def reconstructed(detection: Detection, turns: Sequence[Turn], config: Config) -> list[Scene]:
     """Return the scenes of these turns, the best first; processes start cold."""
-    pool = ScenePool(config, lambda: ChildWorker(threads=config.threads),
+    pool = ScenePool(config, lambda: ChildWorker(threads=config.workers),
                      partial(load_engine, config.reconstruct.used))
     try:
         for turn in turns:

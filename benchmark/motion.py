@@ -94,7 +94,7 @@ def rendered(name: str, seed: int, turns: int, cache: Path) -> Driven:
 
 def solved(frames: Iterable[Frame]) -> tuple[Solution, float, str]:
     """Return a drive's solution, the stamp of its first image, and its verdict."""
-    with Calibrator(Config(threads=1)) as calibrator:
+    with Calibrator(Config(workers=1)) as calibrator:
         for frame in frames:
             calibrator.push(frame)
         found = calibrator.calibrate()

@@ -278,11 +278,10 @@ def reconstructed(seed: int, config: Config) -> Case:
             calibrator.push(frame)
         calibrator.detection.finish()
         chosen = calibrator.scenes
-        chosen.submit()
-        scenes, more = chosen.wanted(_silent, True), []
+        scenes, more = calibrator.reconstruct(_silent, True), []
         if chosen.widen():
-            more = chosen.wanted(_silent, True)
-        evidence = evidence_of_detection(calibrator.detection, chosen.built())
+            more = calibrator.reconstruct(_silent, True)
+        evidence = evidence_of_detection(calibrator.detection, chosen.built().values())
         evidence = replace(
             evidence, warnings=(*evidence.warnings, *chosen.warnings), pictures=None,
             left_out=chosen.left_out(), turns=tuple(

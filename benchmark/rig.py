@@ -23,7 +23,7 @@ from dashcalib_ros.demo import RIGS, render_to_bag, rig_drives, true_places
 from dashcalib_ros.demo.rig import SPEC
 from dashcalib_ros.input.motion import Samples, SensorStream
 from dashcalib_ros.rig_session import calibrate_rig
-from dashcalib_ros.workers.worker import one_thread_for_numpy
+from dashcalib_ros.workers.worker import prepare_process
 
 HEAD = """\
 | rig | seed | turns | camera | verdict | rotation off, degrees | its sigma | worst, sigmas | \
@@ -99,5 +99,5 @@ def main() -> None:
 
 
 if __name__ == '__main__':
-    one_thread_for_numpy()
+    prepare_process()
     main()

@@ -62,7 +62,7 @@ def write(drive: Drive, times: Floats, path: Path) -> None:
 
 def row(name: str, path: Path, fps: float | None, centres_s: Sequence[float]) -> list[str]:
     """Calibrate a video; return a line of the table."""
-    found = calibrate(path, fps, Config(seed=0))
+    found = calibrate(path, fps=fps, config=Config(seed=0))
     shutter = found.rolling_shutter
     readout = f'{shutter.readout_ms:.1f} ± {shutter.sigma_ms:.1f}' if shutter else 'none'
     off = [min(abs(turn.stamp_s - centre) for turn in found.turns) for centre in centres_s]

@@ -2,7 +2,6 @@
 """Calibrates a dashcam online, from the turns that the car takes."""
 from __future__ import annotations
 
-import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -22,32 +21,29 @@ if TYPE_CHECKING:
     from dashcalib_ros.formats.rig import load_rig
     from dashcalib_ros.input import Frame
     from dashcalib_ros.input.inputs import open_frames
+    from dashcalib_ros.input.motion import SensorStream
     from dashcalib_ros.judge import Check
     from dashcalib_ros.pipeline import Calibrator
     from dashcalib_ros.report import AcceptedCalibration, Calibration, NamedCamera, Verdict
     from dashcalib_ros.report.compare import Comparison, compare
     from dashcalib_ros.rig.placed import RigCalibration
     from dashcalib_ros.rig_session import calibrate_rig
+    from dashcalib_ros.selection import Status
     from dashcalib_ros.session import calibrate, check
 
     __version__: str
 
-from dashcalib_ros.limits import PIXELS
-
-# OpenCV reads it when it is loaded; image headers are checked before decoding, too
-os.environ.setdefault('OPENCV_IO_MAX_IMAGE_PIXELS', str(PIXELS))
-
 __all__ = ['AcceptedCalibration', 'Brown', 'Calibration', 'Calibrator', 'Camera', 'Check',
            'Comparison', 'Config', 'ConfigError', 'DashcalibError', 'Fisheye', 'Frame',
            'InputError', 'NamedCamera', 'NotAcceptedError', 'OutputError', 'Radial', 'Rational',
-           'RigCalibration', 'Verdict', 'WorkerError', '__version__', 'calibrate',
-           'calibrate_rig', 'check', 'compare', 'export', 'load_camera', 'load_rig',
+           'RigCalibration', 'SensorStream', 'Status', 'Verdict', 'WorkerError', '__version__',
+           'calibrate', 'calibrate_rig', 'check', 'compare', 'export', 'load_camera', 'load_rig',
            'open_frames']
 
 _HOMES = {'Calibrator': 'pipeline', 'Check': 'judge', 'Comparison': 'report.compare',
           'Config': 'config', 'Frame': 'input', 'calibrate': 'session', 'check': 'session',
           'calibrate_rig': 'rig_session', 'RigCalibration': 'rig.placed',
-          'load_rig': 'formats.rig',
+          'load_rig': 'formats.rig', 'SensorStream': 'input.motion', 'Status': 'selection',
           'export': 'formats', 'load_camera': 'formats', 'open_frames': 'input.inputs',
           **dict.fromkeys(('AcceptedCalibration', 'Calibration', 'NamedCamera', 'Verdict',
                            'compare'), 'report'),
@@ -69,5 +65,5 @@ def __getattr__(name: str) -> Any:
         try:
             return version('dashcalib_ros')
         except PackageNotFoundError:
-            return 'not installed (running from its sources)'
+            return '0+sources'  # not installed
     raise AttributeError(f'module {__name__!r} has no attribute {name!r}')

@@ -15,6 +15,7 @@ import difflib
 import functools
 import math
 import re
+import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib.util import find_spec
@@ -290,6 +291,10 @@ class MonitorConfig:
         0.0, 100.0)
 
 
+# settings by their earlier names, which are read, too
+RENAMED = {'threads': 'workers'}
+
+
 @dataclass(frozen=True)
 class Config:
     """All settings; frozen. Config.of({'turns.wanted': 8}, seed=1) has these, and the defaults.
@@ -300,7 +305,7 @@ class Config:
 
     seed: int = expert(
         0, 'random seed; the same input and seed give the same result', 0, 2**31 - 1)
-    threads: int = setting(
+    workers: int = setting(
         2, 'processes that reconstruct turns in parallel; the result does not depend on it', 1, 64)
     model: str = setting(
         'auto', 'lens model: radial, brown or fisheye; auto: the one that the turns support')
@@ -336,6 +341,11 @@ class Config:
                                   f"Config.of({{'{group.name}.NAME': VALUE}}), not {value!r:.80}")
         for name, spec, value in _settings(self):
             _check(name, spec, value)
+
+    @property
+    def threads(self) -> int:
+        """Return workers, by its earlier name."""
+        return self.workers
 
     def flat(self) -> dict[str, Any]:
         """Return every setting by its full name, in order."""
@@ -403,7 +413,15 @@ def _dotted(changes: Mapping[str, Any], known: Mapping[str, Any]) -> Iterator[tu
             yield from ((f'{key}.{inner}', item) for inner, item in value.items())
         # None: a group of which every line is a comment
         elif value is not None or key not in groups:
-            yield str(key), value
+            yield present_name(str(key)), value
+
+
+def present_name(name: str) -> str:
+    """Return a setting's name; one that was renamed since may have its earlier one."""
+    if name not in RENAMED:
+        return name
+    warnings.warn(f'the setting {name} is called {RENAMED[name]} now', FutureWarning, 2)
+    return RENAMED[name]
 
 
 def describe() -> Iterator[tuple[str, dataclasses.Field[Any]]]:

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Set
-from dataclasses import replace
+from dataclasses import dataclass
 
 from dashcalib_ros.arrays import Mask
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Turn, TurnId
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.detect.turn import is_turn
-from dashcalib_ros.errors import Notice, WorkerError
+from dashcalib_ros.errors import Notice
 from dashcalib_ros.reconstruct.scene import Scene
+from dashcalib_ros.report.turns import direction
 from dashcalib_ros.store.scene_file import Origin, StoredTurn
 from dashcalib_ros.store.turn_store import TurnStore
-from dashcalib_ros.workers.memory import in_a_file
 from dashcalib_ros.workers.pool import ScenePool
-from dashcalib_ros.workers.worker import Progress
 
 # why a turn is not used, in words
 NO_SCENE = ('its pictures gave no scene: too dark, blurred or empty to follow enough points, or '
@@ -24,14 +23,59 @@ NO_SCENE = ('its pictures gave no scene: too dark, blurred or empty to follow en
 UNCONFIRMED = 'this drive has no turn that could agree with it'
 # turns that wait for better ones; of KITTI 03 five are reconstructed then, not eight
 WAITING = 3
+# degrees of yaw; what has less is straight on
+BEND_DEG = 3.0
+
+
+@dataclass(frozen=True)
+class Status:
+    """The calibrator's state after a frame.
+
+    frames: pushed so far. turns: in the bank and stored. built: how many turns' scenes a
+    calibration would use now; ready: these turns; yaw_deg: the sum of their yaw. stretches: of
+    the drive besides that it would use; bends: how many of these have yaw. stored: how many turns
+    are of earlier drives. magnitude: the newest filtered turning magnitude, of the image width.
+    yaws_deg: of the turns in ready, in their order; ways: where these go, as direction() says.
+    reconstructed: the turns that have scenes, chosen or not. two_cameras: what the newest images
+    show, if they are of two.
+    """
+
+    frames: int
+    turns: int
+    built: int
+    yaw_deg: float
+    magnitude: float
+    standing: bool
+    ready: tuple[TurnId, ...] = ()
+    stored: int = 0
+    yaws_deg: tuple[float, ...] = ()
+    reconstructed: tuple[TurnId, ...] = ()
+    two_cameras: str = ''
+    ways: tuple[str, ...] = ()
+    stretches: tuple[TurnId, ...] = ()
+    bends: int = 0
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to be done with the turns of a drive.
+
+    keep: the turns and stretches that still count; None: all. build: to be reconstructed, in this
+    order, each with where the ego vehicle is not; their images are released then. set_aside: turns
+    whose images wait in files.
+    """
+
+    keep: Set[TurnId] | None = None
+    build: tuple[tuple[Turn, Mask | None], ...] = ()
+    set_aside: tuple[Turn, ...] = ()
 
 
 class SceneSelection:
     """Decides which turns are reconstructed and which scenes count, stored ones too.
 
+    It only looks at the detection and the workers: the Calibrator carries out what it plans.
     config: turns.wanted is what want() was called with last. warnings: about turns.store, and
-    about turns that ended the workers. stored_before: the turns of earlier drives that the last
-    wanted() had to choose from. All methods are for the Calibrator's thread.
+    about turns that repeat others. All methods are for the Calibrator's thread.
     """
 
     def __init__(self, config: Config, detection: Detection, workers: ScenePool,
@@ -40,7 +84,6 @@ class SceneSelection:
         """live, use_stored, warn: as the Calibrator's."""
         self.config = config
         self.warnings: list[Notice] = []
-        self.stored_before: tuple[StoredTurn, ...] = ()
         self._detection = detection
         self._workers = workers
         self._live = live
@@ -55,6 +98,8 @@ class SceneSelection:
         self._stretches = config.turns.thorough
         # why turns do not count any more
         self._excluded: dict[TurnId, str] = {}
+        # those of this drive that count as turns without a scene
+        self._rejected: set[TurnId] = set()
         # where the ego vehicle is not, by turn
         self._valid: dict[TurnId, Mask | None] = {}
         # the turns whose pictures are in files
@@ -107,7 +152,7 @@ class SceneSelection:
             return
         for key in reasons:
             if self._store.turns.pop(key, None) is None:
-                self._workers.reject(key)
+                self._rejected.add(key)
         self._save()
 
     def exclude_repeated(self, repeated: Mapping[TurnId, TurnId]) -> None:
@@ -118,7 +163,7 @@ class SceneSelection:
 
     def left_out(self) -> dict[TurnId, str]:
         """Return why turns that were tried are without a scene now, in words."""
-        built = self._workers.scenes()
+        built = self.built()
         failed = {turn: NO_SCENE for turn, scene in built.items() if scene is None}
         alone = {} if len(failed) < len(built) else dict.fromkeys(self._store.turns, UNCONFIRMED)
         return failed | alone | self._excluded
@@ -172,21 +217,21 @@ class SceneSelection:
 
     # turns -> scenes --------------------------------------------------------------------------
 
-    def submit(self, more_to_come: bool = False, replace_failed: bool = False) -> None:
-        """Have the best turns reconstructed; live: all, as a scene is a fiftieth of its images.
+    def plan(self, more_to_come: bool = False) -> Plan:
+        """Choose the best turns for reconstruction; live: all, as a scene is small.
 
-        more_to_come: the least of them wait, for better ones may take their places.
-        replace_failed: turns that gave no scene are replaced by the next best. Only calibrations
-        do that: which turns are reconstructed must not depend on the speed of the workers.
+        more_to_come: the least of them wait, for better ones may take their places. Else turns
+        that gave no scene are replaced by the next best; only when all are done, as which turns
+        are reconstructed must not depend on the speed of the workers.
         """
-        turns = {turn.id: turn for turn in self._detection.turns()}
-        self._store.drop_repeated(turn.stamp_s for turn in turns.values())
-        built = self._workers.scenes()
+        turns, built = {turn.id: turn for turn in self._detection.turns()}, self.built()
+        self._store.drop_repeated(
+            (turn.stamp_s for turn in turns.values()),
+            () if more_to_come else (scene for scene in built.values() if scene is not None))
         # how many turns there are is known at the end of the drive
         count = sum(turn not in built or built[turn] is not None for turn in turns)
         stretches = () if more_to_come else self._other_stretches(count)
         turns |= {turn.id: turn for turn in self._detection.stretches()}
-        self._workers.keep_only(set(turns))
         self._excluded = {key: why for key, why in self._excluded.items()
                           if key in turns or key in self._store.turns}
         # the mask of when a turn was found: what waits must not change its scene
@@ -197,91 +242,72 @@ class SceneSelection:
             turn = turns.get(key)
             if turn is not None and (places > 0 or self._live) and turn.frames:
                 ready.append(turn)
-            if not (replace_failed and key in built and built[key] is None):
+            if more_to_come or key not in built or built[key] is not None:
                 places -= 1
         ready += [turn for turn in stretches if turn.frames]
-        if ready:
-            self._workers.start()
         waiting = WAITING if more_to_come and not self._live else 0
         due = ready[:max(len(ready) - waiting, 0)]
-        for turn in due:
-            self._workers.submit(turn, self._valid[turn.id])
-            self._detection.release(turn.center)
-        if not self._live:
-            held = {turn.id for turn in self._detection.turns() if turn.frames}
-            for key in held - self._in_a_file - {turn.id for turn in due}:
-                self._set_aside(turns[key])
+        held = set() if self._live else {
+            turn.id for turn in self._detection.turns() if turn.frames}
+        aside = held - self._in_a_file - {turn.id for turn in due}
+        self._in_a_file |= aside
+        return Plan(turns.keys(), tuple((turn, self._valid[turn.id]) for turn in due),
+                    tuple(turns[key] for key in aside))
 
-    def submit_stretch(self) -> None:
-        """Have another stretch of a live drive reconstructed, where workers have nothing to do.
+    @property
+    def few(self) -> bool:
+        """Return whether a live drive has so few turns that other stretches are worth a worker.
 
-        None once a single turn is missing: that one must not wait for a worker.
+        Not once a single turn is missing: that one must not wait for a worker.
         """
-        few = (self._stretches_wanted
-               and len(self._detection.turns()) < max(self._places - 1, 1))
-        self._detection.want_stretches(few)
-        if few and not self._workers.unbuilt():
-            for turn in self._detection.stretches():
-                if turn.frames:
-                    self._workers.submit(turn, self._detection.valid())
-                    self._detection.release(turn.center)
+        return (self._stretches_wanted
+                and len(self._detection.turns()) < max(self._places - 1, 1))
 
-    def _set_aside(self, turn: Turn) -> None:
-        images = in_a_file([frame.image for frame in turn.frames])
-        self._detection.exchange(turn.center, tuple(
-            replace(frame, image=image)
-            for frame, image in zip(turn.frames, images, strict=True)))
-        self._in_a_file.add(turn.id)
+    def stretch_plan(self) -> Plan:
+        """Choose other stretches of a live drive, where workers have nothing to do."""
+        if not self.few or self._workers.unbuilt():
+            return Plan()
+        return Plan(build=tuple((turn, self._detection.valid())
+                                for turn in self._detection.stretches() if turn.frames))
 
-    def make_room(self) -> None:
-        """Wait, unless live, until few turns wait in memory; raises what a worker raised."""
-        if not self._live:
-            # one beside those that the workers have: the detection goes on, and none of them idles
-            self._workers.wait(lambda: len(self._workers.unbuilt()) <= self.config.threads + 1)
-
-    def wanted(self, progress: Progress, final: bool) -> list[Scene]:
-        """Wait for the best turns' scenes and return them, the best first.
-
-        final: the drive is over. progress: called with the stage and the share done. Raises what
-        a worker raised, and WorkerError when closed meanwhile.
-        """
-        # wait for all turns, also those that are not used: the report must not depend on the
-        # speed of the workers
-        everything = final or not self._live
-        while True:
-            total = max(len(self._workers.unbuilt()), 1)
-
-            def ready(total: int = total) -> bool:
-                waiting = len(self._workers.unbuilt())
-                progress('reconstructing turns', max(0.0, 1 - waiting / total))
-                return waiting == 0 if everything or not waiting else not self._undecided()
-
-            self._workers.wait(ready)
-            if self._workers.closed:
-                raise WorkerError('E-CALIBRATOR-CLOSED',
-                                  'the calibrator was closed while it calibrated')
-            # only when all are done: what is submitted must not depend on the workers' speed
-            own = [scene for scene in self._workers.scenes().values() if scene is not None]
-            self._store.drop_repeated((), own)
-            self.submit(replace_failed=True)
-            self.store_new()
-            if not (self._undecided() or (everything and self._workers.unbuilt())):
-                self.stored_before = self.stored()
-                return self.chosen()
-
-    def _undecided(self) -> bool:
+    def undecided(self) -> bool:
         """Return whether a turn that is not built yet may be among the best."""
         unbuilt = self._workers.unbuilt()
         return any(key in unbuilt for key in self._best({*unbuilt, *self.all_scenes()}))
 
     def all_scenes(self) -> dict[TurnId, Scene]:
         """Return all scenes, those of earlier drives too."""
-        own = {key: scene for key, scene in self._workers.scenes().items() if scene is not None}
+        own = {key: scene for key, scene in self.built().items() if scene is not None}
         return {**own, **{key: turn.scene for key, turn in self._store.turns.items()}}
 
-    def built(self) -> Collection[Scene | None]:
+    def built(self) -> dict[TurnId, Scene | None]:
         """Return the results of this drive's turns: scenes, None for a turn that gave none."""
-        return self._workers.scenes().values()
+        return {key: None if key in self._rejected else scene
+                for key, scene in self._workers.scenes().items()}
+
+    def reconstructed(self) -> list[Scene]:
+        """Return all scenes of turns, chosen or not, those of earlier drives too."""
+        return self.turns_of(self.all_scenes().values())
+
+    def status(self) -> Status:
+        """Return the present state; scenes that are new are written to turns.store.
+
+        Those of a drive of two cameras are not.
+        """
+        self.store_new()
+        found, used, stored = self._detection, self.chosen(), len(self._store.turns)
+        chosen = self.turns_of(used)
+        turns = {scene.turn for scene in chosen}
+        further = [scene for scene in used if scene.turn not in turns]
+        return Status(
+            found.frames, len(found.turns()) + stored, len(chosen),
+            sum(scene.yaw_deg for scene in chosen), found.magnitude, found.standing,
+            tuple(scene.turn for scene in chosen), stored,
+            tuple(scene.yaw_deg for scene in chosen),
+            tuple(scene.turn for scene in self.reconstructed()),
+            str(found.other_camera) if found.mixed else '', tuple(map(direction, chosen)),
+            tuple(scene.turn for scene in further),
+            sum(scene.yaw_deg >= BEND_DEG for scene in further))
 
     # turns.store ------------------------------------------------------------------------------
 
@@ -291,7 +317,7 @@ class SceneSelection:
 
     def store_new(self) -> None:
         """Write scenes that were built since the last call to turns.store."""
-        built = {turn for turn, scene in self._workers.scenes().items() if scene is not None}
+        built = {turn for turn, scene in self.built().items() if scene is not None}
         if not built <= self._written:
             self._save()
 
@@ -307,11 +333,12 @@ class SceneSelection:
 
     def _save(self) -> None:
         """Write the present scenes to turns.store; of two cameras in a stream there are none."""
-        built = self._workers.scenes() if self._detection.other_camera is None else {}
-        self._written = self._workers.scenes().keys()
+        built = self.built()
+        self._written = built.keys()
         everything = (*self._detection.turns(), *self._detection.stretches())
         own = {turn.id: StoredTurn(scene, turn.stamp_s, turn.prominence)
-               for turn in everything if (scene := built.get(turn.id)) is not None}
+               for turn in everything if (scene := built.get(turn.id)) is not None
+               and self._detection.other_camera is None}
         self._store.mirror({**self._store.turns, **own})
 
     def _store_failed(self, notice: Notice) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy.typing as npt
 
+from dashcalib_ros import judge
 from dashcalib_ros.arrays import Mask
 from dashcalib_ros.camera import searched
 from dashcalib_ros.config import Config
@@ -28,8 +29,10 @@ from dashcalib_ros.input.poses import Poses, track_poses
 from dashcalib_ros.input.source import size_text
 from dashcalib_ros.judge import Check, Odometry
 from dashcalib_ros.judge.calibration import Material
+from dashcalib_ros.judge.conclude import Outlook, outlook
+from dashcalib_ros.judge.witnesses import SensorComparison
 from dashcalib_ros.limits import path_of
-from dashcalib_ros.pipeline import Calibrator, Outlook
+from dashcalib_ros.pipeline import Calibrator
 from dashcalib_ros.report import Calibration, NamedCamera
 from dashcalib_ros.workers.worker import Progress
 
@@ -93,7 +96,8 @@ def open_drive(path: Paths, topic: str | None = None, fps: float | None = None,
     sensors. temperature: of the camera, a CSV or a topic of a bag. Raises InputError.
     """
     valid, paths = mask_of(mask), as_list(path)
-    source = open_frames(paths, topic, fps, start_s, duration_s, stamps)
+    source = open_frames(paths, topic=topic, fps=fps, start_s=start_s, duration_s=duration_s,
+                         stamps=stamps)
     source = source if crop is None else source.cropped(*crop)
     if isinstance(motion, SensorStream):
         return Recording(source, valid, _on_clock_of(source, motion))
@@ -131,7 +135,10 @@ def outlook_of(drive: Recording, config: Config | None = None,
     """Find the turns of a recorded drive, and say whether they are enough for a calibration."""
     observer = observer or Observer()
     with learned_drive(drive, config, observer, False) as calibrator:
-        return calibrator.outlook(observer.show)
+        calibrator.detection.finish()
+        scenes = calibrator.reconstruct(observer.show, final=True)
+        evidence = calibrator.evidence(time.monotonic(), SensorComparison())
+        return outlook(scenes, evidence, calibrator.scenes.config.verdict)
 
 
 def check_drive(drive: Recording, named: NamedCamera, config: Config | None = None,
@@ -140,22 +147,32 @@ def check_drive(drive: Recording, named: NamedCamera, config: Config | None = No
     """Calibrate a recorded drive, and compare a given camera with what its turns show.
 
     named: the given camera, of the pictures as they are stored. poses: true ones of the drive;
-    track: GPS positions, from which poses are made. Raises InputError as Calibrator.odometry().
+    track: GPS positions, from which poses are made. Raises InputError where no turn
+    has poses.
     """
     observer = observer or Observer()
     given = drive.source.shown(named.camera)
     with learned_drive(drive, config, observer, verbose) as calibrator:
         calibration = calibrator.calibrate(observer.show)
-        check = calibrator.check(given, calibration, observer.show, named.name)
+        observer.show('the turns with the given camera', 0.0)
+        solution, run, settings = (calibrator.solution, calibrator.workers.run,
+                                   calibration.config)
+        check: Check = run(judge.check, given, calibration.image_size, solution,
+                           calibration.verdict, settings, calibrator.detection.lines(), named.name)
         if given.image_size != calibration.image_size:
             return Checked(check, calibration)  # it explains no motion either
-        changes = tuple(str(change) for change in calibrator.watch(given).changes)
+        lens = calibrator.detection.resized(given)
+        readings = run(judge.readings_of, calibrator.scenes.reconstructed(), lens, settings)
+        monitor = judge.watch(readings, lens, None, settings.monitor)
         if track is not None:
             track = _on_clock_of(drive.source, track).since(calibration.start_s)
             assert track.position is not None
             poses = track_poses(track.position, calibration.start_s)
-        odometry = None if poses is None else calibrator.odometry(given, poses, observer.show)
-    return Checked(check, calibration, changes, odometry)
+        odometry: Odometry | None = None
+        if poses is not None and solution is not None:
+            observer.show('the turns beside the poses', 0.0)
+            odometry = run(judge.beside_poses, solution, lens, poses, settings)
+    return Checked(check, calibration, tuple(map(str, monitor.changes)), odometry)
 
 
 @contextmanager
@@ -206,7 +223,7 @@ def _feed(taker: Calibrator, drive: Recording, observer: Observer) -> None:
             check_mask(drive.mask, frame.size)
         taker.push(frame)
         observer.show('reading', min(number / count, 1.0) if count else None,
-                      f'frame {number}, {counted(len(taker.turns()), "turn")}')
+                      f'frame {number}, {counted(len(taker.detection.turns()), "turn")}')
 
 
 def drive_motion(path: Paths, motion: str | os.PathLike[str] | None = None,
@@ -335,31 +352,30 @@ def settings_of(config: Settings, model: str | None) -> Config:
     return found
 
 
-def calibrate(path: Paths, fps: float | None = None, config: Settings = None,
-              topic: str | None = None, start_s: float = 0.0,
-              duration_s: float | None = None, mask: MaskOrPath = None,
-              progress: Progress | None = None, motion: MotionOrPath = None,
-              model: str | None = None, crop: Part | None = None,
-              temperature: str | None = None) -> Calibration:
+def calibrate(path: Paths, *, topic: str | None = None, fps: float | None = None,
+              start_s: float = 0.0, duration_s: float | None = None, crop: Part | None = None,
+              mask: MaskOrPath = None, motion: MotionOrPath = None,
+              temperature: str | None = None, model: str | None = None,
+              config: Settings = None, progress: Progress | None = None) -> Calibration:
     """Calibrate a recorded drive.
 
     path: a ROS 2 bag (folder, .mcap, .db3), a ROS 1 .bag, a video, a folder of images, or several
     of these of one camera (a sequence, a folder of videos, or a pattern such as 'clips/*.mp4').
-    fps: images per second of a folder without times (default 10), or instead of a video's rate.
-    config: the settings: a Config, or a mapping such as {'turns.wanted': 8}; None: the defaults.
     topic: the image topic of a bag; needed only when it has several.
+    fps: images per second of a folder without times (default 10), or instead of a video's rate.
     start_s, duration_s: the part of the drive to use, in seconds; None: to its end.
+    crop: (x, y, width, height) of the part of the pictures that is used, px, as one of two cameras
+    side by side; the mask is of that part, and so is the camera.
     mask: the part of the pictures that is not used (bonnet, burnt-in text): the path of a picture
     that is black there, or an array (height, width) that is 0 or False there; it is added to the
     automatic mask.
-    progress: called with the name of a stage and its fraction done, 0 to 1; at last 'done', 1.0.
     motion: data of the car's own sensors: the path of a CSV, a GPX file or a KITTI oxts folder, or
-    a stream. None: the topics of the bag, if path is one.
-    model: the lens model, over that of config: radial, brown, fisheye, or auto.
-    crop: (x, y, width, height) of the part of the pictures that is used, px, as one of two cameras
-    side by side; the mask is of that part, and so is the camera.
+    a SensorStream. None: the topics of the bag, if path is one.
     temperature: of the camera, which its focal length may follow: the path of a CSV (stamp_s and
     temperature, in degrees Celsius), or a topic of the bag.
+    model: the lens model, over that of config: radial, brown, fisheye, or auto.
+    config: the settings: a Config, or a mapping such as {'turns.wanted': 8}; None: the defaults.
+    progress: called with the name of a stage and its fraction done, 0 to 1; at last 'done', 1.0.
 
     Returns a Calibration: its verdict.level is 'accepted', 'weak' or 'refused', and its camera is
     None if it is refused; accepted() returns it, or raises. Raises InputError for input that
@@ -372,29 +388,28 @@ def calibrate(path: Paths, fps: float | None = None, config: Settings = None,
         return calibrate_drive(drive, settings, observer)
 
 
-def check(given: Given, path: Paths, fps: float | None = None, config: Settings = None,
-          topic: str | None = None, start_s: float = 0.0,
-          duration_s: float | None = None, mask: MaskOrPath = None,
-          progress: Progress | None = None, motion: MotionOrPath = None,
-          model: str | None = None, crop: Part | None = None) -> Check:
+def check(given: Given, path: Paths, *, topic: str | None = None, fps: float | None = None,
+          start_s: float = 0.0, duration_s: float | None = None, crop: Part | None = None,
+          mask: MaskOrPath = None, motion: MotionOrPath = None, model: str | None = None,
+          config: Settings = None, progress: Progress | None = None) -> Check:
     """Check whether a calibration fits a recorded drive.
 
     given: the calibration: a Calibration, what load_camera() returns, the path of a file that it
     reads, or a Radial, Brown, Rational or Fisheye of the drive's pictures.
     path: a ROS 2 bag (folder, .mcap, .db3), a ROS 1 .bag, a video, a folder of images, or several
     of these of one camera (a sequence, a folder of videos, or a pattern such as 'clips/*.mp4').
-    fps: images per second of a folder without times (default 10), or instead of a video's rate.
-    config: the settings: a Config, or a mapping such as {'turns.wanted': 8}; None: the defaults.
     topic: the image topic of a bag; needed only when it has several.
+    fps: images per second of a folder without times (default 10), or instead of a video's rate.
     start_s, duration_s: the part of the drive to use, in seconds; None: to its end.
-    mask: the part of the pictures that is not used: the path of a picture that is black there, or
-    an array (height, width) that is 0 or False there.
-    progress: called with the name of a stage and its fraction done, 0 to 1; at last 'done', 1.0.
-    motion: data of the car's own sensors: the path of a CSV, a GPX file or a KITTI oxts folder, or
-    a stream. None: the topics of the bag, if path is one.
-    model: the lens model, over that of config: radial, brown, fisheye, or auto.
     crop: (x, y, width, height) of the part of the pictures that is used, px, as one of two cameras
     side by side; the mask is of that part, and so is the camera.
+    mask: the part of the pictures that is not used: the path of a picture that is black there, or
+    an array (height, width) that is 0 or False there.
+    motion: data of the car's own sensors: the path of a CSV, a GPX file or a KITTI oxts folder, or
+    a SensorStream. None: the topics of the bag, if path is one.
+    model: the lens model, over that of config: radial, brown, fisheye, or auto.
+    config: the settings: a Config, or a mapping such as {'turns.wanted': 8}; None: the defaults.
+    progress: called with the name of a stage and its fraction done, 0 to 1; at last 'done', 1.0.
 
     Returns a Check: its answer is 'right', 'differs' (good enough for the uses in its good_for),
     'wrong' or 'cannot tell', with reasons. Raises InputError for what cannot be read, ConfigError

@@ -11,6 +11,8 @@ import pytest
 # several tests run at a time they mostly wait for each other
 for name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
     os.environ.setdefault(name, '1')
+# as in a program of ours, whose stderr has no lines of OpenCV
+os.environ.setdefault('OPENCV_LOG_LEVEL', 'SILENT')
 
 # the tests start some hundred processes. Where Python may write no compiled files beside the
 # sources, each would compile all that it imports, for seconds: they share a folder

@@ -24,7 +24,7 @@ ONE_TURN, OTHER_TURN = 58, 45
 # enough for this drive, and quick: other tests have the other cores, and a process takes a second
 # to start
 QUICK = Config().replace({
-    'threads': 1, 'turns.wanted': 2, 'tracks.points': 350, 'scene.tracks': 250,
+    'workers': 1, 'turns.wanted': 2, 'tracks.points': 350, 'scene.tracks': 250,
     'scene.profile_tracks': 150, 'scene.keyframes': 20, 'scene.profile_keyframes': 10,
     'intrinsics.profile_tracks': 40})
 

@@ -47,7 +47,7 @@ def test_about_twenty_settings_are_for_users_and_come_first():
     assert experts == sorted(experts)
     users = {name for name in SPECS if not SPECS[name].metadata['expert']}
     assert 10 <= len(users) <= 22
-    assert {'turns.wanted', 'turns.store', 'threads', 'motion.rate'} <= users
+    assert {'turns.wanted', 'turns.store', 'workers', 'motion.rate'} <= users
     assert not {'scene.loss_px', 'intrinsics.loss', 'verdict.max_leverage'} & users
 
 
@@ -144,11 +144,17 @@ def test_an_integer_that_no_float_can_hold(value):
         Config(motion=MotionConfig(rate=value))
 
 
+def test_a_renamed_setting_is_read_with_a_warning():
+    with pytest.warns(FutureWarning, match='workers'):
+        config = Config.of({'threads': 3})
+    assert config.workers == config.threads == 3 and 'threads' not in config.flat()
+
+
 def test_a_config_made_directly_is_checked_too():
     with refused(ConfigError, 'E-CONFIG-RANGE', 'turns.wanted'):
         Config(turns=TurnsConfig(wanted=0))
-    with refused(ConfigError, 'E-CONFIG-RANGE', 'threads'):
-        Config(threads=0)
+    with refused(ConfigError, 'E-CONFIG-RANGE', 'workers'):
+        Config(workers=0)
     with refused(ConfigError, 'E-CONFIG-FINITE', 'motion.rate'):
         Config(motion=MotionConfig(rate=math.nan))
 

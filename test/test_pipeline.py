@@ -24,6 +24,7 @@ import pytest
 from shared_drive import LENS, ONE_TURN, OTHER_TURN, QUICK, SharedDrive
 from synthetic import synthetic_turn
 
+from dashcalib_ros import judge
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import Config
 from dashcalib_ros.demo import Drive, DriveSpec, Lens
@@ -33,8 +34,8 @@ from dashcalib_ros.detect.one_camera import OtherCamera
 from dashcalib_ros.errors import InputError, WorkerError
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.motion import Samples, SensorStream
-from dashcalib_ros.judge.agreement import OTHER_CAMERA
-from dashcalib_ros.judge.conclude import STOOD, conclude, evidence_of_detection
+from dashcalib_ros.judge.agreement import OTHER_CAMERA, STOOD
+from dashcalib_ros.judge.conclude import conclude, evidence_of_detection
 from dashcalib_ros.pipeline import Calibrator
 from dashcalib_ros.reconstruct import reconstruct
 from dashcalib_ros.reconstruct.scene import Scene
@@ -132,7 +133,7 @@ def test_the_pictures_of_a_turn_that_waits_are_in_a_file(frames):
     with limited(Calibrator(QUICK)) as calibrator:
         for frame in frames:
             calibrator.push(frame)
-            if waiting := calibrator.turns():
+            if waiting := calibrator.detection.turns():
                 break
     shown = waiting[0].frames
     assert len(shown) > 10
@@ -174,7 +175,7 @@ def test_two_threads_and_a_child_that_is_killed_change_nothing(frames, result):
                     killed.append(pid)
 
     ended = threading.Event()
-    with limited(Calibrator(QUICK.replace({'threads': 2}))) as calibrator:
+    with limited(Calibrator(QUICK.replace({'workers': 2}))) as calibrator:
         thread = threading.Thread(target=assassin, args=(calibrator, ended), daemon=True)
         thread.start()
         try:
@@ -213,9 +214,10 @@ def test_a_live_calibrator_gives_the_same_even_if_asked_on_the_way_with_a_turn_l
         for frame in frames[ONE_TURN:]:
             calibrator.push(frame)
             # whatever waits, waits in the pool, whose queue has an end
-            assert not any(turn.frames for turn in calibrator.turns())
+            assert not any(turn.frames for turn in calibrator.detection.turns())
         late = calibrator.calibrate()
-        asked = [calibrator.check(lens, late) for lens in (TRUE, LONGER)]
+        asked = [judge.check(lens, late.image_size, calibrator.solution, late.verdict, QUICK,
+                             calibrator.detection.lines()) for lens in (TRUE, LONGER)]
         pids = calibrator.workers.pids()
         assert pids and all(os.getpriority(os.PRIO_PROCESS, pid) >= 10 for pid in pids)
     assert len(told) == 1 and 'exit code -9' in told[0] and 'is tried again' in told[0]
@@ -292,7 +294,7 @@ def test_what_fails_beside_the_solution_costs_itself_only(frames, monkeypatch):
         sound = calibrator.calibrate()
         calibrator.sense(SensorStream(rate=Samples(np.arange(9.0), np.zeros((9, 3)))))
         for part in ('detect.detection.Detection.lines', 'detect.detection.Detection.straights',
-                     'pipeline.turns_that_stood'):
+                     'judge.agreement.turns_that_stood'):
             monkeypatch.setattr(f'dashcalib_ros.{part}', broken)
         # in the child it raises
         monkeypatch.setattr('dashcalib_ros.pipeline.compare_sensors', child_tasks.fail)
@@ -485,17 +487,22 @@ def test_a_camera_in_use_is_compared_with_stored_turns(tmp_path):
     with Calibrator(QUICK.replace({'turns.store': str(tmp_path)})) as calibrator:
         calibrator.push(pictures(1, 640, 360)[0])
         # a single image shows no straight road
-        assert calibrator.moved(lens, 100) is None
+        assert judge.moved(calibrator.detection.straights(100), lens) is None
         with pytest.raises(InputError, match='of another size'):
-            calibrator.moved(replace(lens, image_size=(320, 180)), 100)
-        assert calibrator.watch(lens, sigma).lens is None
-        change, = calibrator.watch(replace(lens, fx=10 * lens.fx), sigma).changes
+            calibrator.detection.resized(replace(lens, image_size=(320, 180)))
+
+        def watched(camera):
+            readings = calibrator.workers.run(
+                judge.readings_of, calibrator.scenes.reconstructed(), camera, QUICK)
+            return judge.watch(readings, camera, sigma, QUICK.monitor)
+        assert watched(lens).lens is None
+        change, = watched(replace(lens, fx=10 * lens.fx)).changes
         assert change.kind == 'lens' and change.since == TurnId.stored(0)
         # of other turns than these it knows nothing
-        assert not calibrator.watch(lens, sigma).agrees
+        assert not watched(lens).agrees
         calibrator.scenes.forget_stored({TurnId.stored(1)})
         assert calibrator.status().reconstructed == (TurnId.stored(1),)
-        assert len(calibrator.watch(lens, sigma).readings) == len(list(tmp_path.iterdir())) == 1
+        assert len(watched(lens).readings) == len(list(tmp_path.iterdir())) == 1
 
 
 def standing(on: str) -> Iterator[Frame]:
@@ -559,17 +566,13 @@ def test_turns_of_this_drive_come_before_more_prominent_ones_of_earlier_drives(o
 
 
 def live_selection(turns, stretches, busy=()):
-    """Return a live drive's selection, what it submits, and whether it wants more stretches."""
-    submitted, wanted = [], []
-    selection = SceneSelection(
+    """Return a live drive's selection."""
+    return SceneSelection(
         QUICK.replace({'turns.wanted': 5}),
         types.SimpleNamespace(
             turns=lambda: tuple(Turn(n, n, n, float(n), 0.1) for n in range(turns)),
-            stretches=lambda: stretches, valid=lambda: None, want_stretches=wanted.append,
-            release=lambda center: None),
-        types.SimpleNamespace(scenes=dict, unbuilt=lambda: frozenset(busy),
-                              submit=lambda turn, valid: submitted.append(turn.center)), True)
-    return selection, submitted, wanted
+            stretches=lambda: stretches, valid=lambda: None),
+        types.SimpleNamespace(scenes=dict, unbuilt=lambda: frozenset(busy)), True)
 
 
 @pytest.mark.parametrize(('turns', 'busy', 'asked', 'begun'), [
@@ -578,10 +581,10 @@ def live_selection(turns, stretches, busy=()):
 def test_a_live_drive_takes_a_stretch_while_workers_idle_and_turns_are_few(
         frames, turns, busy, asked, begun):
     stretches = (Turn(20, 0, 40, 2.0, 0.002), Turn(50, 41, 80, 5.0, 0.001, tuple(frames[:2])))
-    selection, submitted, wanted = live_selection(turns, stretches, busy)
+    selection = live_selection(turns, stretches, busy)
     selection.want(5, 0, asked)
-    selection.submit_stretch()
-    assert submitted == begun and wanted == [asked and turns < 4]
+    assert [turn.center for turn, _ in selection.stretch_plan().build] == begun
+    assert selection.few == (asked and turns < 4)
 
 
 def test_stretches_of_earlier_drives_fill_up_and_are_no_turns():
@@ -605,16 +608,15 @@ def test_stretches_of_earlier_drives_fill_up_and_are_no_turns():
 @pytest.mark.parametrize(('more_to_come', 'begun'), [(True, [0]), (False, [0, 1, 2, 3])])
 def test_the_least_turns_wait_for_better_ones(frames, more_to_come, begun):
     turns = tuple(Turn(n, n, n, float(n), 0.1 - 0.01 * n, tuple(frames[:2])) for n in range(4))
-    nothing, submitted = types.SimpleNamespace(), []
-    nothing.exchange = nothing.release = nothing.keep_only = nothing.start = lambda *given: None
     selection = SceneSelection(
         QUICK.replace({'turns.wanted': 5}),
-        types.SimpleNamespace(**vars(nothing), turns=lambda: turns, stretches=tuple,
-                              valid=lambda: None),
-        types.SimpleNamespace(**vars(nothing), scenes=dict,
-                              submit=lambda turn, valid: submitted.append(turn.center)))
-    selection.submit(more_to_come)
-    assert submitted == begun
+        types.SimpleNamespace(turns=lambda: turns, stretches=tuple, valid=lambda: None),
+        types.SimpleNamespace(scenes=dict))
+    plan = selection.plan(more_to_come)
+    assert [turn.center for turn, _ in plan.build] == begun
+    assert {turn.center for turn in plan.set_aside} == {0, 1, 2, 3} - {*begun}
+    # once each
+    assert selection.plan(more_to_come).set_aside == ()
 
 
 def test_turns_that_are_rejected_leave_the_store(tmp_path):

@@ -9,6 +9,7 @@ import pickle
 import subprocess
 import sys
 import types
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 import cv2
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 from fakes import stands_in_for
 from made_calibration import MOUNT, TRUTH, make_calibration
+from packaging.version import Version
 from refused import refused
 
 import dashcalib_ros
@@ -31,6 +33,7 @@ from dashcalib_ros import (
     check,
     compare,
     export,
+    judge,
     load_camera,
     open_frames,
     session,
@@ -45,7 +48,7 @@ ERRORS = ('ConfigError', 'DashcalibError', 'InputError', 'NotAcceptedError', 'Ou
           'WorkerError')
 NAMES = (*FUNCTIONS, *ERRORS, 'AcceptedCalibration', 'Calibration', 'Calibrator', 'Config',
          'Check', 'Comparison', 'NamedCamera', 'Frame', 'Camera', 'Radial', 'Brown', 'Fisheye',
-         'Rational', 'RigCalibration', 'Verdict')
+         'Rational', 'RigCalibration', 'SensorStream', 'Status', 'Verdict')
 # what mypy --strict accepts of a user
 SCRIPT = """
 from dashcalib_ros import calibrate
@@ -57,7 +60,50 @@ print(found.camera.fx, found.sigma['fx'], found.K @ found.rays([[0.0, 0.0]])[0],
 def test_all_names_are_there_to_see():
     assert {*NAMES, '__version__'} == set(dashcalib_ros.__all__)
     assert dir(dashcalib_ros) == sorted(dashcalib_ros.__all__)
-    assert dashcalib_ros.__version__[0].isdigit() or 'sources' in dashcalib_ros.__version__
+    assert Version(dashcalib_ros.__version__)
+
+
+def test_an_import_changes_nothing_in_its_process():
+    script = """
+import os, apsw, cv2
+from rosbags.rosbag1 import reader
+get_level = getattr(cv2, 'getLogLevel', None) or cv2.utils.logging.getLogLevel
+def state():
+    return dict(os.environ), get_level(), cv2.getNumThreads(), dict(reader.decompressors), list(
+        apsw.connection_hooks)
+before = state()
+import dashcalib_ros
+for name in dashcalib_ros.__all__:
+    getattr(dashcalib_ros, name)
+import dashcalib_ros.input.decode, dashcalib_ros.input.bag_read
+assert state() == before, state()
+"""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith('OPENCV_')}
+    subprocess.run([sys.executable, '-c', script], env=kept, check=True)
+
+
+def test_what_is_not_installed_has_a_version_too(monkeypatch):
+    monkeypatch.setattr('importlib.metadata.version', raising(PackageNotFoundError()))
+    assert Version(dashcalib_ros.__version__).local == 'sources'
+
+
+def raising(error):
+    def fail(name):
+        raise error
+    return fail
+
+
+@pytest.mark.parametrize('name', [name for name in FUNCTIONS if name != 'calibrate_rig'])
+def test_what_follows_the_path_is_named(name):
+    order = ('topic', 'fps', 'start_s', 'duration_s', 'stamps', 'crop', 'mask', 'motion', 'model',
+             'config', 'progress')
+    options = [each.name for each in
+               inspect.signature(getattr(dashcalib_ros, name)).parameters.values()
+               if each.default is not inspect.Parameter.empty]
+    known = [each for each in order if each in options]
+    assert [each for each in options if each in order] == known
+    assert all(inspect.signature(getattr(dashcalib_ros, name)).parameters[each].kind
+               is inspect.Parameter.KEYWORD_ONLY for each in options)
 
 
 def test_every_error_is_a_child_of_one():
@@ -81,6 +127,10 @@ class FakeCalibrator:
     def __init__(self, config=None, mask=None, verbose=False):
         type(self).config = config
         type(self).mask, type(self).motion, type(self).frames = mask, None, 0
+        self.detection = types.SimpleNamespace(turns=tuple, lines=lambda: None,
+                                               resized=lambda camera: camera)
+        self.workers = types.SimpleNamespace(run=self._run)
+        self.scenes, self.solution = types.SimpleNamespace(reconstructed=list), None
 
     def sense(self, motion):
         type(self).motion = motion
@@ -92,16 +142,12 @@ class FakeCalibrator:
         progress('solving', 1.0)
         return make_calibration()
 
-    def check(self, given, calibration, progress=None, name=''):
-        type(self).given = given
-        progress('checking', 1.0)
+    def _run(self, function, *given):
+        """Answer in a worker's place."""
+        if function is judge.readings_of:
+            return ()
+        type(self).given = given[0]
         return Check('right', (), 0.0, 1.0)
-
-    def watch(self, camera, sigma=None):
-        return types.SimpleNamespace(changes=())
-
-    def turns(self):
-        return ()
 
     def close(self):
         pass

@@ -26,8 +26,8 @@ ALLOWED: dict[str, set[str]] = {
     'arrays': set(),
     'robust': {'arrays'},
     'whole_files': set(),
-    '__init__': {'pipeline', 'camera', 'input', 'judge', 'formats', 'report', 'session',
-                 'rig', 'rig_session'},
+    '__init__': {'pipeline', 'camera', 'input', 'judge', 'formats', 'report', 'selection',
+                 'session', 'rig', 'rig_session'},
     '__main__': {'cli'},
     'demo': {'camera', 'input', 'judge'},
 }

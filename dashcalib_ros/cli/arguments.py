@@ -329,9 +329,11 @@ COMMANDS = {
         'them. Writes result.json, report.html and, if accepted, calibration.yaml to DIR.',
         "dashcalib run 'clips/*.mp4' --out calibration", (
             INPUT, *DRIVE, *MOTION, MODEL, SEED,
-            ('--threads', {'type': int, 'metavar': 'N',
+            ('--workers', {'type': int, 'metavar': 'N', 'dest': 'turn_workers',
                            'help': 'processes that reconstruct turns in parallel; the result does '
                                    'not depend on it'}),
+            # its earlier name
+            ('--threads', {'type': int, 'dest': 'turn_workers', 'help': argparse.SUPPRESS}),
             ('--speed', {'type': POSITIVE, 'metavar': 'KMH',
                          'help': 'constant speed of the car on straight roads; from it follows '
                                  'the height of the camera'}),

@@ -14,9 +14,9 @@ from dashcalib_ros.errors import ConfigError, InputError, shortened
 from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
 from dashcalib_ros.session import Recording
 
-# --turns sets both, so that exactly this number of turns is used
+# --turns sets both, so that exactly this number of turns is used; --workers of batch is another
 FLAGS = {'turns': ('turns.wanted', 'turns.at_most'), 'thorough': ('turns.thorough',),
-         'seed': ('seed',), 'threads': ('threads',),
+         'seed': ('seed',), 'turn_workers': ('workers',),
          'segmentation': ('mask.segmentation',), 'model': ('model',),
          'speed': ('mount.speed_kmh',), 'mount': ('mount.enabled',),
          'gyro_scale_sigma': ('motion.gyro_scale_sigma',)}

@@ -24,7 +24,7 @@ from dashcalib_ros.cli.arguments import (
 )
 from dashcalib_ros.errors import DashcalibError, InputError, OutputError, WorkerError
 from dashcalib_ros.standard_streams import open_closed_streams, own_stderr, write_stderr
-from dashcalib_ros.workers.worker import one_thread_for_numpy
+from dashcalib_ros.workers.worker import prepare_process
 
 
 def command() -> NoReturn:
@@ -48,7 +48,7 @@ def command() -> NoReturn:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command and return its exit code; argv: arguments without the program's name."""
     open_closed_streams()
-    one_thread_for_numpy()
+    prepare_process()
     # the handler is set inside try: a signal may also come while it is set or restored
     try:
         parser = make_parser()

@@ -19,7 +19,7 @@ from dashcalib_ros.errors import InputError, Notice, counted, spared
 from dashcalib_ros.formats import result_json
 from dashcalib_ros.formats.ours import codes_of
 from dashcalib_ros.input import FrameSource
-from dashcalib_ros.pipeline import Outlook
+from dashcalib_ros.judge.conclude import Outlook
 from dashcalib_ros.report import Calibration, Written, output_folder, write_results
 from dashcalib_ros.report.tables import (
     TextTable,
@@ -28,7 +28,7 @@ from dashcalib_ros.report.tables import (
     next_step,
     summary,
 )
-from dashcalib_ros.report.wording import cures, optional
+from dashcalib_ros.report.wording import optional, remedies
 from dashcalib_ros.session import calibrate_drive, outlook_of
 from dashcalib_ros.standard_streams import write_stdout
 
@@ -157,6 +157,6 @@ def _enough(found: Outlook) -> tuple[str, str]:
     if not verdict.accepted:
         return (f'{text}: not enough, the result would be {verdict.level}: '
                 f'{"; ".join(each.what for each in verdict.told)}',
-                f'next: {cures(verdict)[0]}')
+                f'next: {remedies(verdict)[0]}')
     gentle = '' if max(yaws) >= SHARP_DEG else ', but without a sharp turn it may be weak'
     return f'{text}: enough for a calibration{gentle}', 'next: dashcalib run with the same INPUT'

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Mask
-from dashcalib_ros.camera.camera import resized_pixels
+from dashcalib_ros.camera.camera import Camera, resized_pixels
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.detector import TurnDetector
 from dashcalib_ros.detect.edges import LineCollector, Lines
@@ -21,6 +21,7 @@ from dashcalib_ros.errors import InputError, Notice
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.decode import check_mask
 from dashcalib_ros.input.scale import FULL_SIZE, Scale
+from dashcalib_ros.input.source import size_text
 
 # images after which the unit of the time stamps is checked; ns between images of a camera of
 # 2 kHz: with microseconds, any camera above 2 Hz seems to be faster
@@ -56,7 +57,7 @@ class Detection:
         self._first_ns = self._last_ns = 0
         self._rises = 0
         self.standing = False
-        self._config = config
+        self._config, self._keep = config, keep
         self._motion = MotionEstimator(config.motion, config.mask, mask)
         self._two_pictures = TwoPictures()
         self._lines = LineCollector(beside=beside)
@@ -138,10 +139,28 @@ class Detection:
 
     def release(self, center: int) -> None:
         """Free the images of the turn with this center; the turn itself is kept."""
-        self.exchange(center, ())
+        self._exchange(center, ())
 
-    def exchange(self, center: int, frames: tuple[Frame, ...]) -> None:
-        """Replace the images of the turn with this center by the same ones, stored elsewhere."""
+    def set_aside(self, turn: Turn) -> None:
+        """Keep the images of a turn where those of other stretches are."""
+        assert self._keep is not None
+        images = self._keep([frame.image for frame in turn.frames])
+        self._exchange(turn.center, tuple(replace(frame, image=image) for frame, image
+                                          in zip(turn.frames, images, strict=True)))
+
+    def resized(self, camera: Camera) -> Camera:
+        """Return a camera of the input's pictures as one of the resized pictures.
+
+        Raises InputError where it is for pictures of another size.
+        """
+        if camera.image_size != self.size:
+            raise InputError('E-CALIBRATION-SIZE',
+                             f'the given camera is for pictures of another size: '
+                             f'{size_text(camera.image_size)}; resize it with dashcalib export '
+                             f'--size')
+        return camera.resized(1 / self.scale.px, self.scale.size(self.size))
+
+    def _exchange(self, center: int, frames: tuple[Frame, ...]) -> None:
         self._turns.bank.exchange(center, frames)
         self._stretches.exchange(center, frames)
 

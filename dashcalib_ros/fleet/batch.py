@@ -235,7 +235,7 @@ def solved_file(camera: str, make: str, clips: Sequence[tuple[str, str, str]], c
 
     Other clips, other settings and another version of this package have another one.
     """
-    settings = {key: value for key, value in config.flat().items() if key != 'threads'}
+    settings = {key: value for key, value in config.flat().items() if key != 'workers'}
     version = versions(config.reconstruct)['dashcalib_ros']
     key = hash_of([solved.FORMAT, version, camera, make, clips, settings])
     return f'solved/{key[:2]}/{key}.json'

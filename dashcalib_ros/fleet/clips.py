@@ -39,7 +39,7 @@ from dashcalib_ros.workers.memory import in_a_file
 
 # settings by which a clip's scenes do not change
 LATER = ('intrinsics.', 'verdict.', 'fleet.', 'known.')
-LATER_NAMES = ('threads', 'rectified', 'turns.store')
+LATER_NAMES = ('workers', 'rectified', 'turns.store')
 GONE = InputError('E-CLIP-MISSING', 'there is no such file; check the path')
 # what is gathered of a clip; 2: its upright lines, too; 3: other stretches than turns
 GATHERED = 3
@@ -242,7 +242,7 @@ def gather(path: Path, content: str, fps: float | None, topic: str | None, confi
     content: the clip's content_hash(). Raises InputError for what cannot be read, and for the
     images of two cameras.
     """
-    source = open_frames(path, topic, fps)
+    source = open_frames(path, topic=topic, fps=fps)
     detection = detect(source, config, keep=in_a_file)
     if detection.other_camera is not None:
         raise InputError('E-TWO-CAMERAS', f'{detection.other_camera}: {APART}')

@@ -65,7 +65,7 @@ NAMED = ('.json', '.yaml', '.yml')
 Given = CalibrationData | NamedCamera | Camera | str | os.PathLike[str]
 
 
-def load_camera(path: str | os.PathLike[str], name: str | None = None,
+def load_camera(path: str | os.PathLike[str], *, name: str | None = None,
                 image_size: Size | None = None, nearest: bool = False) -> NamedCamera:
     """Read a camera from a calibration; returns it with its name, and sigma and verdict if known.
 

@@ -22,7 +22,7 @@ from dashcalib_ros.camera import MODELS, Camera, Radial
 from dashcalib_ros.camera.field import BASIS, Field
 from dashcalib_ros.camera.field import TERMS as FIELD_TERMS
 from dashcalib_ros.camera.other import OtherLens
-from dashcalib_ros.config import Config
+from dashcalib_ros.config import RENAMED, Config
 from dashcalib_ros.detect import Bend, TurnId
 from dashcalib_ros.errors import DashcalibError, InputError, Notice, code_of, one_line
 from dashcalib_ros.formats import opencv, ros
@@ -149,8 +149,8 @@ def calibration_of(data: Data, camera: Camera | None) -> CalibrationData:
             ('stamp_s' if key == 'stamp' else key): _frozen(item) for key, item in values.items()})
 
     known = Config().flat()
-    config = Config().replace({name: value for name, value in data.get('config', {}).items()
-                               if name in known})
+    settings = {RENAMED.get(name, name): value for name, value in data.get('config', {}).items()}
+    config = Config().replace({name: value for name, value in settings.items() if name in known})
     held_out = [LeftOut(
         TurnId.stored(place) if turn['center'] is None else TurnId.at(turn['center']),
         turn['px'], turn['sigma_px'], turn['others_sigma_px'])

@@ -122,31 +122,14 @@ def unpacked_limit(path: Path) -> int:
     return max(UNPACKED_LEAST, UNPACKED_RATIO * path.stat().st_size)
 
 
-class _WithinLimit:
-    """Lets rosbags read within our limits, which it has not, while a reader of ours is open.
-
-    It finds its unpackers in a table, and SQLite its limits in a list of hooks. What else uses
-    them in this process keeps its own as soon as the last reader is closed, in whatever order
-    they are.
-    """
-
-    def __init__(self) -> None:
-        self._readers = 0
-        self._own: dict[str, Any] = dict(rosbag1.decompressors)
-
-    def __enter__(self) -> None:
-        self._readers += 1
-        apsw.connection_hooks.append(_whole)
-        rosbag1.decompressors.update({kind: partial(unpack, kind) for kind in self._own})
-
-    def __exit__(self, *error: object) -> None:
-        self._readers -= 1
+@contextmanager
+def within_limit() -> Iterator[None]:
+    """Let rosbags read a database within our limits, which SQLite finds in a list of hooks."""
+    apsw.connection_hooks.append(_whole)
+    try:
+        yield
+    finally:
         apsw.connection_hooks.remove(_whole)
-        if not self._readers:
-            rosbag1.decompressors.update(self._own)
-
-
-WITHIN_LIMIT = _WithinLimit()
 
 
 # views, virtual tables, generated columns and long defaults make contents that a file has not
@@ -232,7 +215,11 @@ class _Ros1Reader(rosbag1.Reader):
         assert self.bio is not None
         if self.bio.tell() < self._end:
             raise InputError('E-BAG-INDEX', 'chunks overlap')
-        return super().read_chunk()
+        chunk = super().read_chunk()
+        # ours take a limit
+        kind = next(kind for kind, own in rosbag1.decompressors.items()
+                    if own is chunk.decompressor)
+        return chunk._replace(decompressor=partial(unpack, kind))
 
     def read_index_data(self, pos: int, indexes: dict[int, list[rosbag1.IndexData]]) -> None:
         assert self.bio is not None
@@ -251,7 +238,6 @@ class _Ros1Reader(rosbag1.Reader):
             raise InputError('E-BAG-INDEX', 'the file is longer than its header indicates')
         unpacking = _Unpacking(Path(str(self.path)))
         for pos, chunk in self.chunks.items():
-            # the one of the table, which takes a limit
             own: Any = chunk.decompressor
             self.chunks[pos] = chunk._replace(decompressor=partial(unpacking.through, own))
 
@@ -262,7 +248,7 @@ class _FolderReader(rosbag2.reader.DirectoryReader):
 
 
 class Reader2(rosbag2.Reader):
-    """rosbags' reader of a ROS 2 bag; within limits while WITHIN_LIMIT is entered."""
+    """rosbags' reader of a ROS 2 bag; databases within limits in within_limit()."""
 
     STORAGE_PLUGINS: Mapping[str, Any] = {'dir': _FolderReader, '.mcap': _McapReader,
                                           '.db3': storage_sqlite3.Sqlite3Reader}
@@ -402,7 +388,7 @@ def _counts_in_index(path: Path) -> Counter[tuple[str, str]]:
         with McapFile(path, refuse) as contents:
             return contents.counts()
     counts = Counter[tuple[str, str]]()
-    with WITHIN_LIMIT, _reader(path) as reader:
+    with within_limit(), _reader(path) as reader:
         for connection in reader.connections:
             counts[connection.topic, connection.msgtype] += connection.msgcount
     return counts
@@ -465,7 +451,7 @@ def by_time(parts: Iterable[tuple[int, Callable[[], Iterable[T]]]], time_of: Cal
 
 
 def _indexed_records(path: Path, topics: Collection[str]) -> Iterator[Record]:
-    with WITHIN_LIMIT, _reader(path) as reader:
+    with within_limit(), _reader(path) as reader:
         wanted = [each for each in reader.connections if each.topic in topics]
         missing = sum(connection.msgcount for connection in wanted)
         if not wanted:

@@ -18,13 +18,13 @@ from dashcalib_ros.camera.camera_info import RosCamera
 from dashcalib_ros.camera.remap import SAME
 from dashcalib_ros.errors import InputError, OutputError
 from dashcalib_ros.input.bag_read import (
-    WITHIN_LIMIT,
     Reader2,
     has_other_encodings,
     mcap_contents,
     record_of,
     refuse,
     unpacked,
+    within_limit,
 )
 from dashcalib_ros.input.bag_storage import open_bag
 from dashcalib_ros.input.encodings import CAMERA_INFOS, CDR, message_of
@@ -246,7 +246,7 @@ def _opened(source: str | os.PathLike[str], image_topic: str | None) -> Iterator
     with ExitStack() as opened:
         try:
             _check_limits(path)
-            opened.enter_context(WITHIN_LIMIT)
+            opened.enter_context(within_limit())
             reader = opened.enter_context(Reader2(path))
         except Exception as error:  # a damaged file makes rosbags raise nearly anything
             raise InputError('E-BAG-DAMAGED',

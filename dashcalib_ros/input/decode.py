@@ -40,13 +40,6 @@ if sys.version_info >= (3, 14):
 else:
     from backports import zstd
 
-# OpenCV reports every defect of a file on stderr; what a user must know comes as our own errors.
-# Who wants to see the rest sets OPENCV_LOG_LEVEL
-if 'OPENCV_LOG_LEVEL' not in os.environ:
-    # OpenCV 4 has it elsewhere
-    set_log_level = getattr(cv2, 'setLogLevel', None) or cv2.utils.logging.setLogLevel
-    set_log_level(0)  # LOG_LEVEL_SILENT
-
 _DEPTHS = (8, 10, 12, 14, 16)
 _JPEG_START, _JPEG_END = b'\xff\xd8', b'\xff\xd9'
 # bytes before the encoding in a message of zstd_image_transport

@@ -71,7 +71,7 @@ MOST_MISSING = 3
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
 
-def open_frames(path: Paths, topic: str | None = None, fps: float | None = None,
+def open_frames(path: Paths, *, topic: str | None = None, fps: float | None = None,
                 start_s: float = 0.0, duration_s: float | None = None,
                 stamps: str | os.PathLike[str] | None = None) -> FrameSource:
     """Open a recorded drive. The kind of input is detected from the content of the files.

@@ -8,7 +8,7 @@ None, and a warning states the reason: the calibration goes on without it.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from typing import Any
@@ -355,6 +355,15 @@ def speeds_of(stream: SensorStream) -> Samples | None:
         return None
     way = np.linalg.norm(places[later, :2] - places[:, :2], axis=1)
     return Samples((stamps_s + passed / 2)[known], (way[known] / passed[known])[:, None])
+
+
+def temperature_of(streams: Iterable[SensorStream | None], start_s: float) -> Samples | None:
+    """Return the temperature of the first stream that has one, on the images' clock, else None."""
+    for stream in streams:
+        found = None if stream is None else stream.since(start_s).temperature
+        if found is not None:
+            return Samples(found.stamps_s + start_s, found.values)
+    return None
 
 
 def values_in(message: Any, option: str) -> Iterator[tuple[str, tuple[float, ...]]]:

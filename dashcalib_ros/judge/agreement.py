@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dashcalib_ros.detect.turn import TurnId
+from dashcalib_ros.input.motion import SensorStream
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.robust import weighted_mean
 from dashcalib_ros.solve.solution import Solution
@@ -18,6 +19,18 @@ MAX_MISFIT = 2.0
 # why turns do not count
 CONTRADICTS = 'the camera of the other turns does not explain it'
 OTHER_CAMERA = 'the turns of this drive are of another camera'
+STOOD = 'according to its speed the car stood: other things turned, or the camera alone'
+
+
+def turns_that_stood(scenes: Sequence[Scene], motion: SensorStream | None, start_s: float
+                     ) -> dict[TurnId, str]:
+    """Return the turns of this drive during which the car stood, as its speed says.
+
+    start_s: stamp of the drive's first image.
+    """
+    stream = (motion or SensorStream()).since(start_s)
+    return {scene.turn: STOOD for scene in scenes if scene.turn.of_this_drive
+            and stream.stood(*(scene.tracks.stamps_ns[[0, -1]] / 1e9 - start_s))}
 
 
 def turns_of_another_camera(misfits: Mapping[TurnId, float]) -> set[TurnId]:

@@ -65,9 +65,14 @@ class Verdict:
         return tuple(reason.code for reason in self.reasons)
 
     @property
-    def cures(self) -> tuple[str, ...]:
+    def remedies(self) -> tuple[str, ...]:
         """Return what to do, the likeliest to help first."""
         return tuple(dict.fromkeys(each.remedy for each in self.reasons if each.remedy))
+
+    @property
+    def cures(self) -> tuple[str, ...]:
+        """Return remedies, by their earlier name."""
+        return self.remedies
 
     @property
     def accepted(self) -> bool:

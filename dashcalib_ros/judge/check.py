@@ -98,13 +98,19 @@ CALIBRATION = 'CALIBRATION'
 
 
 def check(given: Camera, image_size: tuple[int, int], solution: Solution | None, verdict: Verdict,
-          config: Config, name: str = CALIBRATION) -> Check:
+          config: Config, lines: Lines | None = None, name: str = CALIBRATION) -> Check:
     """Say whether a given camera explains a drive.
 
     image_size: of the drive's pictures. solution, verdict: of the drive; a solution that is not
-    accepted neither confirms nor contradicts a calibration. name: of the given camera's file, for
-    the command that a message offers. Loads COLMAP.
+    accepted neither confirms nor contradicts a calibration. lines: of the resized pictures. name:
+    of the given camera's file, for the command that a message offers. Loads COLMAP.
     """
+    found = _by_turns(given, image_size, solution, verdict, config, name)
+    return found if lines is None else with_lines(found, given, lines, image_size, config)
+
+
+def _by_turns(given: Camera, image_size: tuple[int, int], solution: Solution | None,
+              verdict: Verdict, config: Config, name: str) -> Check:
     if verdict.level != 'accepted' or solution is None:
         if given.image_size == image_size:
             return Check('cannot tell', tuple(

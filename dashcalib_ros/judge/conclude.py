@@ -18,11 +18,11 @@ from dashcalib_ros.detect import Bend, Lines, bend
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.detect.one_camera import OtherCamera
 from dashcalib_ros.detect.straights import Straights
-from dashcalib_ros.detect.turn import Turn, TurnId
+from dashcalib_ros.detect.turn import Turn, TurnId, is_turn
 from dashcalib_ros.errors import Notice, counted, spared
 from dashcalib_ros.input.motion import Samples, SensorStream, speeds_of
 from dashcalib_ros.input.scale import Scale
-from dashcalib_ros.judge.agreement import CONTRADICTS, focal_disagreement
+from dashcalib_ros.judge.agreement import CONTRADICTS, STOOD, focal_disagreement
 from dashcalib_ros.judge.calibration import (
     CalibrationData,
     CameraAt,
@@ -60,7 +60,6 @@ from dashcalib_ros.store.scene_file import StoredTurn
 
 # why turns are not used
 NOT_NEEDED = 'more prominent turns were enough'
-STOOD = ('according to its speed the car stood: other things turned, or the camera alone')
 
 
 @dataclass(frozen=True)
@@ -118,17 +117,6 @@ def evidence_of_detection(detection: Detection, scenes: Iterable[Scene | None] =
         other_camera=other, start_s=detection.start_s, lines=lines, straights=straights)
 
 
-def turns_that_stood(scenes: Sequence[Scene], motion: SensorStream | None, start_s: float
-                     ) -> dict[TurnId, str]:
-    """Return the turns of this drive during which the car stood, as its speed says.
-
-    start_s: stamp of the drive's first image.
-    """
-    stream = (motion or SensorStream()).since(start_s)
-    return {scene.turn: STOOD for scene in scenes if scene.turn.of_this_drive
-            and stream.stood(*(scene.tracks.stamps_ns[[0, -1]] / 1e9 - start_s))}
-
-
 def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> CalibrationData:
     """Return the calibration; a refused one has no intrinsics, so that they cannot be used.
 
@@ -173,11 +161,33 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
     return replace(found, warnings=(*found.warnings, *_warnings(found, solution, evidence), *lost))
 
 
-def outlook(scenes: Sequence[Scene], evidence: Evidence, config: VerdictConfig) -> Verdict:
-    """Return the best verdict that the number of turns and their angles allow, as judge() counts.
+@dataclass(frozen=True)
+class Outlook:
+    """The turns of a drive, and what a calibration of it can come to at best.
 
-    scenes: that a calibration would use.
+    turns: of this drive, the best first. yaws_deg: of the turns that a calibration would use, by
+    their ids, those of earlier drives too. verdict: accepted where their number and their angles
+    are enough; their pictures decide the rest. start_s: stamp of the first image.
     """
+
+    frames: int
+    turns: tuple[Turn, ...]
+    yaws_deg: Mapping[TurnId, float]
+    verdict: Verdict
+    warnings: tuple[Notice, ...]
+    start_s: float
+
+
+def outlook(scenes: Sequence[Scene], evidence: Evidence, config: VerdictConfig) -> Outlook:
+    """Return the best that a drive can come to. scenes: that a calibration would use."""
+    return Outlook(evidence.frames, tuple(turn for turn in evidence.turns
+                                          if is_turn(turn.prominence)),
+                   {scene.turn: scene.yaw_deg for scene in scenes},
+                   _best_verdict(scenes, evidence, config), evidence.warnings, evidence.start_s)
+
+
+def _best_verdict(scenes: Sequence[Scene], evidence: Evidence, config: VerdictConfig) -> Verdict:
+    """Return what the number of turns and their angles allow, as judge() counts."""
     if not scenes:
         return _verdict_without_solution(evidence, config)
     # a gyro may confirm a single turn

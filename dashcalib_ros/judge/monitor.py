@@ -374,14 +374,19 @@ class Monitor:
 
 
 def watch(readings: Iterable[Reading], camera: Camera, sigma: Mapping[str, float] | None,
-          config: MonitorConfig) -> Monitor:
-    """Return the state after turns, in the order of time.
+          config: MonitorConfig, px: float = 1.0) -> Monitor:
+    """Return whether turns show that a camera in use has changed.
 
     camera: of the readings' pictures. sigma: of its parameters, as far as they are known; None
-    for a camera that is not known to have fitted any turns before these.
+    for a camera that is not known to have fitted any turns before these: then only turns behind
+    one that it explains can show a change. px: of the pictures that sigma is for, in one of the
+    readings'.
     """
-    monitor = Monitor(camera, _covariance(camera, sigma or {}), config, sigma is not None)
-    for reading in readings:
+    known = dict(zip(camera.names(), camera.units(px).tolist(), strict=True))
+    monitor = Monitor(camera, _covariance(camera, {
+        name: value / known.get(name, 1.0) for name, value in (sigma or {}).items()}), config,
+        sigma is not None)
+    for reading in sorted(readings, key=lambda reading: reading.turn):
         monitor = monitor.after(reading)
     return monitor
 

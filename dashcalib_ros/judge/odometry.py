@@ -9,7 +9,7 @@ in every frame that is fixed to the car: nothing has to be known of where the po
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,10 +17,12 @@ from dashcalib_ros.arrays import Floats, Ints
 from dashcalib_ros.camera import Camera, Radial
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import TurnId
-from dashcalib_ros.errors import InputError
+from dashcalib_ros.errors import InputError, spared
 from dashcalib_ros.input.poses import Poses
 from dashcalib_ros.judge.calibration import Witness
+from dashcalib_ros.judge.witnesses import clock_of_poses
 from dashcalib_ros.reconstruct.scene import Scene
+from dashcalib_ros.solve.solution import Solution
 
 # keyframes with poses; a turn with fewer says nothing
 LEAST_KEYFRAMES = 4
@@ -94,6 +96,20 @@ class Odometry:
 def trivial_guess(image_size: tuple[int, int]) -> Camera:
     """Return what people assume of an unknown camera: f is the width, the centre in the middle."""
     return Radial.centred(image_size, float(image_size[0]))
+
+
+def beside_poses(solution: Solution, given: Camera, poses: Poses, config: Config) -> Odometry:
+    """Compare the motion that cameras find in the turns with true poses.
+
+    The cameras: given, of the turns' pictures; the drive's own; and a trivial guess. Raises
+    InputError where no turn has poses.
+    """
+    own = solution.camera
+    cameras = {'given': given, 'ours': own, 'guess': trivial_guess(own.image_size)}
+    found = odometry(solution.scenes, cameras, poses, config)
+    # a track has the headings of its way, which are not the car's
+    return found if poses.of_track else replace(found, clock=spared(
+        'the clock of the poses', [], clock_of_poses, solution, poses, config))
 
 
 def odometry(scenes: Sequence[Scene], cameras: Mapping[str, Camera], poses: Poses, config: Config

@@ -41,7 +41,7 @@ from dashcalib_ros.solve.evidence import (
 )
 from dashcalib_ros.solve.solution import Solution
 
-# cures that several rules have
+# remedies that several rules have
 STEADY = 'switch off the stabiliser and fix the zoom, then record another drive'
 MORE_TURNS = 'drive more and sharper turns, as at crossings, in daylight'
 CORNERS = 'drive where there are things to see up to the corners of the picture'

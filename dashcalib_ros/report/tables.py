@@ -23,10 +23,10 @@ from dashcalib_ros.report.compare import (
 )
 from dashcalib_ros.report.wording import (
     PARAMETERS,
-    cures,
     number,
     optional,
     parameter_rows,
+    remedies,
     run_facts,
     since_start,
 )
@@ -83,8 +83,8 @@ def labelled(label: str, word: str) -> Text:
 
 
 def next_step(verdict: Verdict) -> RenderableType:
-    """Return what to do next: all cures, the likeliest to help first."""
-    first, *others = cures(verdict)
+    """Return what to do next: all remedies, the likeliest to help first."""
+    first, *others = remedies(verdict)
     return Group(line(f'next: {first}'), *(line(f'also: {cure}') for cure in others))
 
 

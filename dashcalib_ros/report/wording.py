@@ -18,7 +18,7 @@ ADVICE = {
 }
 # where a calibration that others load is written, by its verdict, and the usual folder
 ACCEPTED, WEAK, FOLDER = 'calibration.yaml', 'calibration.weak.yaml', 'calibration'
-# where a verdict has no cures
+# where a verdict has no remedies
 NEXT = {
     'accepted': 'use calibration.yaml in the camera driver; report.html has the details',
     'weak': 'read report.html before you use calibration.weak.yaml',
@@ -156,9 +156,9 @@ def key_figures(c: CalibrationData) -> list[tuple[str, str, str]]:
     return [*front, *found]
 
 
-def cures(verdict: Verdict) -> tuple[str, ...]:
+def remedies(verdict: Verdict) -> tuple[str, ...]:
     """Return what to do next, the likeliest to help first; of a refused result that one."""
-    found = verdict.cures or (NEXT[verdict.level],)
+    found = verdict.remedies or (NEXT[verdict.level],)
     return found[:1] if verdict.level == 'refused' else found
 
 
@@ -185,7 +185,7 @@ def next_steps(c: CalibrationData, folder: str = FOLDER) -> list[str]:
                     'nothing here.' if c.mount is None else
                     'the mounting only: drive again for it, also straight on.')]
     yaw = c.yaw_deg
-    steps = [f'{cure[0].upper()}{cure[1:]}.' for cure in cures(c.verdict)]
+    steps = [f'{cure[0].upper()}{cure[1:]}.' for cure in remedies(c.verdict)]
     if c.turns_used < c.config.turns.wanted or yaw < needed.min_yaw_deg:
         steps.append(f'For the next drive: {c.config.turns.wanted} turns of 60° or more, at town '
                      f'speed, in daylight. At least {needed.min_turns} turns and '

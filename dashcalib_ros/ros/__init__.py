@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dashcalib_ros.errors import ConfigError, DashcalibError, coded
 from dashcalib_ros.ros.interface import CALIBRATOR, CHECKER
 from dashcalib_ros.standard_streams import open_closed_streams, write_stderr, write_stdout
-from dashcalib_ros.workers.worker import one_thread_for_numpy
+from dashcalib_ros.workers.worker import prepare_process
 
 INSTALL = ("the Python package {name} is missing: source your ROS 2 installation "
            "(. /opt/ros/jazzy/setup.sh), or pip install '.[ros]' (Jazzy) or '.[ros-kilted]' in "
@@ -40,7 +40,7 @@ def main(program: str, argv: Sequence[str] | None = None) -> int:
         if each != signal.SIGHUP or signal.getsignal(each) is not signal.SIG_IGN:
             signal.signal(each, lambda number, frame: signals.append(number))
     open_closed_streams()
-    one_thread_for_numpy()
+    prepare_process()
     try:
         from dashcalib_ros.ros.settings import check_files, help_text, parse
         arguments = list(sys.argv[1:] if argv is None else argv)

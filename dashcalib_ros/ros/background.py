@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from functools import reduce
 from typing import Any
 
+from dashcalib_ros import judge
 from dashcalib_ros.arrays import GreyImage, Mask
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
@@ -18,11 +19,12 @@ from dashcalib_ros.errors import DashcalibError, InputError, coded, counted, one
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.decode import BitDepth, decode
 from dashcalib_ros.input.motion import SensorBuffer
-from dashcalib_ros.judge import Check, Monitor, moved_text
+from dashcalib_ros.judge import Check, Monitor, Reading, moved_text
 from dashcalib_ros.judge.agreement import CONTRADICTS, outdated, turns_of_another_camera
-from dashcalib_ros.pipeline import Calibrator, Status
+from dashcalib_ros.pipeline import Calibrator
 from dashcalib_ros.report import Calibration, NamedCamera
 from dashcalib_ros.report.turns import BACK, LEFT, RIGHT
+from dashcalib_ros.selection import Status
 from dashcalib_ros.workers.memory import mapped_copy
 
 # s between two checks whether enough turns are built: scenes are finished without a push
@@ -161,8 +163,9 @@ class _Bank:
     tried: the turns of the last calibration. logged: those that are in the log. requested: a
     calibration is to begin with the present turns. failures: of calibrations in a row.
     not_before: when the next one may begin, in s of time.monotonic(). read: the turns that were
-    compared with the camera in use. earlier: what those of the banks before said of it. pairs: of
-    straight driving that were asked whether it was moved; moved: whether they said so.
+    compared with the camera in use; readings: what they say. earlier: what those of the
+    banks before said of it. pairs: of straight driving that were asked whether it was moved;
+    moved: whether they said so.
     """
 
     number: int
@@ -174,6 +177,7 @@ class _Bank:
     failures: int = 0
     not_before: float = 0.0
     read: frozenset[TurnId] = frozenset()
+    readings: dict[TurnId, Reading] = field(default_factory=dict)
     earlier: Monitor | None = None
     pairs: int = 0
     moved: bool = False
@@ -325,7 +329,7 @@ class Learner:
         self._note(bank, status)
         if self._watching is not self._goal.camera:
             self._watching, self._monitor, bank.read = self._goal.camera, None, frozenset()
-            bank.moved = False
+            bank.readings, bank.moved = {}, False
         if self._watching is None:
             return
         try:
@@ -344,10 +348,14 @@ class Learner:
         # a long drive thins them out
         if not bank.moved and not 0 <= pairs - bank.pairs < PAIRS_BETWEEN:
             bank.pairs = pairs
-            found = bank.calibrator.moved(camera.camera, PAIRS)
+            detection = bank.calibrator.detection
+            straights = detection.straights(PAIRS)
+            found = bank.calibrator.workers.run(judge.moved, straights,
+                                                detection.resized(camera.camera))
             if found is not None:
                 bank.moved = True
-                self._hear(Moved(camera, moved_text(f'than {found[0]:.0f} s ago', found[1])))
+                ago_s = straights.stamps_s[-1] - found[0]
+                self._hear(Moved(camera, moved_text(f'than {ago_s:.0f} s ago', found[1])))
 
     def _read(self, bank: _Bank, camera: NamedCamera, turns: frozenset[TurnId]) -> None:
         """Compare turns that are new with the camera in use.
@@ -359,7 +367,17 @@ class Learner:
             bank.earlier = self._monitor
         # the same turns alone are not tried again
         bank.read |= turns
-        found = bank.calibrator.watch(camera.camera, camera.sigma)
+        core = bank.calibrator
+        lens, scenes, config = (core.detection.resized(camera.camera),
+                                core.scenes.reconstructed(), core.scenes.config)
+        if new := [scene for scene in scenes if scene.turn not in bank.readings]:
+            bank.readings |= {reading.turn: reading for reading in core.workers.run(
+                judge.readings_of, new, lens, config)}
+        # a stored turn that was driven again counts once
+        there = {scene.turn for scene in scenes}
+        found = judge.watch((reading for turn, reading in bank.readings.items()
+                             if turn.of_this_drive or turn in there), lens, camera.sigma,
+                            config.monitor, core.detection.scale.px)
         if bank.earlier is not None:
             found = reduce(Monitor.after, found.readings, bank.earlier)
         if found.lens and found.lens.confirmed and found.lens.since.of_this_drive:
@@ -399,8 +417,12 @@ class Learner:
                 # both have the same clock, whichever it is
                 bank.calibrator.sense(replace(stream.shifted(-found.start_s), absolute=False))
             calibration = bank.calibrator.calibrate(self._progress, final=False)
-            check = None if given is None else bank.calibrator.check(
-                given.camera, calibration, self._progress)
+            check = None
+            if given is not None:
+                self._progress('the turns with the given camera', 0.0)
+                check = bank.calibrator.workers.run(
+                    judge.check, given.camera, calibration.image_size, bank.calibrator.solution,
+                    calibration.verdict, calibration.config, found.lines())
             of_another = turns_of_another_camera(calibration.misfits)
             bank.calibrator.scenes.exclude(dict.fromkeys(
                 outdated(of_another | calibration.used_turns, of_another), CONTRADICTS))

@@ -175,7 +175,7 @@ class Intake:
     def complain(self, dropped: int, why_lost: str) -> None:
         """Log what went wrong since the last call.
 
-        dropped: images dropped by the detection. why_lost: the causes of lost ones, with cures.
+        dropped: images dropped by the detection. why_lost: the causes of lost ones, with remedies.
         """
         stamps = self._stamps
         for text in self.clock:
@@ -321,20 +321,20 @@ class ImageInput:
 
     @property
     def why_lost(self) -> str:
-        """Return what may lose images, with the cures that are not in use, as far as seen here."""
+        """Return what may lose images, with the remedies not in use, as far as seen here."""
         if self.reliability == 'reliable':
             return ('publisher and subscription are reliable, so the camera driver skips images, '
                     'or this computer is overloaded; check the rate of the driver and the load')
         infos = self._node.get_publishers_info_by_topic(self.topic)
-        cures = ['set reliability to auto' if infos and all(map(_reliable, infos)) else
+        remedies = ['set reliability to auto' if infos and all(map(_reliable, infos)) else
                  'let the driver publish reliable images']
         if self._kind == IMAGE:
-            cures.append('publish compressed images')
+            remedies.append('publish compressed images')
             if get_rmw_implementation_identifier().startswith('rmw_fastrtps'):
-                cures.append("start the driver's process with config/fastdds_large_images.xml "
+                remedies.append("start the driver's process with config/fastdds_large_images.xml "
                              '(this node cannot see whether it already does)')
         return ('either the camera driver skips images: check its rate; or the best-effort '
-                f'transport loses them: {", or ".join(cures)}')
+                f'transport loses them: {", or ".join(remedies)}')
 
     def log_silence(self, silent_s: float | None) -> None:
         """Log from time to time that images are missing; silent_s: since the last one."""

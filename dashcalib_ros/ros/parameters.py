@@ -20,7 +20,7 @@ from rcl_interfaces.srv import ListParameters, SetParameters, SetParametersAtomi
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from dashcalib_ros.config import Config
+from dashcalib_ros.config import Config, present_name
 from dashcalib_ros.errors import ConfigError
 from dashcalib_ros.formats.ros import CAMERA_NAME
 from dashcalib_ros.ros.settings import (
@@ -53,7 +53,7 @@ def given_parameters(program: str) -> dict[str, Any]:
         given = {name: probe.get_parameter(name).value for name in declared_names(probe)}
     finally:
         probe.destroy_node()
-    return {name: value for name, value in given.items() if value is not None}
+    return {present_name(name): value for name, value in given.items() if value is not None}
 
 
 def declare(node: Node, program: str, given: Mapping[str, Any]) -> Settings:

@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable, Set
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 from dashcalib_ros import reconstruct
@@ -17,8 +18,17 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import Turn, TurnId
 from dashcalib_ros.errors import DashcalibError, Notice, WorkerError, coded
 from dashcalib_ros.reconstruct.scene import Draft, Scene, TurnPicture, picture_of
+from dashcalib_ros.workers.child import ChildWorker
 from dashcalib_ros.workers.memory import return_free_memory
-from dashcalib_ros.workers.worker import Progress, Worker, WorkerDiedError
+from dashcalib_ros.workers.worker import (
+    InlineWorker,
+    Progress,
+    Worker,
+    WorkerDiedError,
+    load_all,
+    load_judging,
+    load_solving,
+)
 
 # if a worker dies in the same call this often, seconds apart, the call may be the cause
 ATTEMPTS = 5
@@ -62,7 +72,7 @@ def back_off_s(failures: int) -> float:
 
 
 class ScenePool:
-    """Reconstructs turns in the background, by config.threads workers, and runs other functions.
+    """Reconstructs turns in the background, by config.workers workers, and runs other functions.
 
     A turn takes two calls, its draft and its scene; other calls may run in between. A call whose
     worker dies is tried again after a while; so is a turn's that raises. Only a call in which
@@ -70,13 +80,13 @@ class ScenePool:
     without a scene.
 
     Each worker has a thread of the pool. All methods may be called from any thread; only wait(),
-    run() and result() wait for workers. The pool's threads call on_lost and on_trouble, which
-    must not raise.
+    run() and result() wait for workers. The pool's threads call on_trouble, which must not raise.
+
+    lost: a line for each turn that was given up.
     """
 
     def __init__(self, config: Config, make_worker: Callable[[], Worker],
                  load: Callable[[], object], queue: int | None = None,
-                 on_lost: Callable[[Notice], None] = lambda notice: None,
                  on_trouble: Callable[[str], None] = lambda text: None,
                  keep_pictures: bool = False,
                  on_wait: Callable[[], bool] | None = None) -> None:
@@ -84,8 +94,8 @@ class ScenePool:
 
         queue: how many turns may wait for a worker, with their images; None: any number. If there
         are more, as in a live drive, the least prominent counts as one without a scene.
-        on_lost: called with a line when a turn is given up. on_trouble: called with a line when a
-        worker failed and its work is tried again.
+        on_trouble: called with a line when a worker failed and its work is tried again, and when
+        a turn is given up.
         keep_pictures: pictures() has one of each turn that is done. on_wait: called again and
         again, in the thread that waits, while wait(), run() or result() waits; returns whether it
         did something, and is called again at once then.
@@ -94,8 +104,9 @@ class ScenePool:
         self._load = load
         self._queue = queue
         self._keep_pictures = keep_pictures
-        self._on_lost, self._on_trouble, self._on_wait = on_lost, on_trouble, on_wait
-        self._workers = tuple(make_worker() for _ in range(config.threads))
+        self.lost: list[Notice] = []
+        self._on_trouble, self._on_wait = on_trouble, on_wait
+        self._workers = tuple(make_worker() for _ in range(config.workers))
         self._closed = threading.Event()
         self._threads: list[threading.Thread] = []
         # guards all that follows; held only briefly
@@ -125,11 +136,6 @@ class ScenePool:
             for turn in self._scenes.keys() - turns:
                 del self._scenes[turn]
                 self._pictures.pop(turn, None)
-
-    def reject(self, turn: TurnId) -> None:
-        """Take out a scene that does not fit the others; its turn counts as one without."""
-        with self._changed:
-            self._scenes[turn] = None
 
     def unbuilt(self) -> frozenset[TurnId]:
         """Return the turns that are not done yet."""
@@ -161,6 +167,21 @@ class ScenePool:
 
         self._wait(ended)
 
+    def wait_for_turns(self, progress: Progress, enough: Callable[[], bool]) -> None:
+        """Wait until all turns are done, or these are enough; raises as wait() does.
+
+        progress: called with the stage and the share done. Raises WorkerError when closed.
+        """
+        total = max(len(self.unbuilt()), 1)
+
+        def ready() -> bool:
+            waiting = len(self.unbuilt())
+            progress('reconstructing turns', max(0.0, 1 - waiting / total))
+            return not waiting or enough()
+
+        self.wait(ready)
+        self.check_open()
+
     # other functions --------------------------------------------------------------------------
 
     def run(self, function: Callable[..., Any], *arguments: Any,
@@ -191,8 +212,8 @@ class ScenePool:
         self._wait(ended)
         if call.done and call.error is None:
             return call.result
-        if call.error is None or self._closed.is_set():
-            raise WorkerDiedError('E-CALIBRATOR-CLOSED', 'the calibrator is closed')
+        self.check_open()
+        assert call.error is not None
         raise call.error
 
     def drop(self, call: Call) -> None:
@@ -211,10 +232,10 @@ class ScenePool:
                 for thread in self._threads:
                     thread.start()
 
-    @property
-    def closed(self) -> bool:
-        """Return whether close() was called."""
-        return self._closed.is_set()
+    def check_open(self) -> None:
+        """Raise WorkerDiedError where close() was called."""
+        if self._closed.is_set():
+            raise WorkerDiedError('E-CALIBRATOR-CLOSED', 'the calibrator is closed')
 
     def pids(self) -> list[int]:
         """Return the process ids of the workers that have one."""
@@ -310,8 +331,10 @@ class ScenePool:
         elif isinstance(error, WorkerDiedError):
             # the other turns can still be used
             self._end(call)
-            self._on_lost(Notice('E-TURN-LEFT-OUT', f'{call.turn.id} ended the reconstruction '
-                                 f'process {call.failures} times and was left out'))
+            self.lost.append(Notice(
+                'E-TURN-LEFT-OUT', f'{call.turn.id} ended the reconstruction process '
+                                   f'{call.failures} times and was left out'))
+            self._on_trouble(self.lost[-1])
         else:
             if not isinstance(error, DashcalibError):
                 error = WorkerError('E-TURN-FAILED', f'reconstruction of {call.turn.id} failed: '
@@ -380,3 +403,17 @@ class ScenePool:
     def _notify(self) -> None:
         self._changes += 1
         self._changed.notify_all()
+
+
+def pool_of(config: Config, live: bool, verbose: bool, inline: bool,
+            on_trouble: Callable[[str], None], on_wait: Callable[[], bool] | None) -> ScenePool:
+    """Return the pool of a Calibrator, whose parameters these are."""
+    if live:
+        # nothing else runs during an import: while images come, some would be lost
+        load_judging()
+    return ScenePool(
+        config, InlineWorker if inline else partial(
+            ChildWorker, live, verbose, config.workers, on_trouble),
+        partial(load_all if live else load_solving, config.reconstruct.used),
+        queue=config.turns.wanted if live else None, on_trouble=on_trouble,
+        keep_pictures=not live, on_wait=on_wait)

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from dashcalib_ros.errors import WorkerError
+from dashcalib_ros.limits import PIXELS
 
 Progress = Callable[[str, float], None]
 
@@ -16,13 +17,16 @@ Progress = Callable[[str, float], None]
 THREAD_VARIABLES = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
 
 
-def one_thread_for_numpy() -> None:
-    """Let numpy's libraries use one thread, unless the user set more; before numpy is loaded.
+def prepare_process() -> None:
+    """Set what libraries read as they are loaded, unless the user did; for programs of our own.
 
-    The matrices here are small: a second thread does little but wait, at full speed.
+    numpy's have one thread: the matrices here are small, and a second one does little but wait,
+    at full speed. OpenCV decodes no larger pictures than we do, and does not report every defect
+    of a file on stderr: what a user must know comes as our own errors.
     """
-    for name in THREAD_VARIABLES:
-        os.environ.setdefault(name, '1')
+    for name, value in {**dict.fromkeys(THREAD_VARIABLES, '1'), 'OPENCV_LOG_LEVEL': 'SILENT',
+                        'OPENCV_IO_MAX_IMAGE_PIXELS': str(PIXELS)}.items():
+        os.environ.setdefault(name, value)
 
 
 class WorkerDiedError(WorkerError):
@@ -83,3 +87,24 @@ class InlineWorker:
     def close(self) -> None:
         """Refuse further calls; a running one continues to its end."""
         self._closed = True
+
+
+def load_solving(engine: str) -> None:
+    """Import what a worker needs until the solution, the engine too."""
+    import dashcalib_ros.solve.joint  # noqa: F401
+    from dashcalib_ros.reconstruct import load
+    load(engine)
+
+
+def load_judging() -> None:
+    """Import what judges a result, and what that may need: it takes half a second."""
+    from scipy import optimize, special  # noqa: F401
+    from scipy.spatial import transform  # noqa: F401
+
+    import dashcalib_ros.judge.conclude  # noqa: F401
+
+
+def load_all(engine: str) -> None:
+    """Import what a worker of a live drive needs until the result."""
+    load_judging()
+    load_solving(engine)

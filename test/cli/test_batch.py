@@ -9,6 +9,9 @@ import pytest
 from made_drives import smooth, write_video
 
 from dashcalib_ros.cli import main
+from dashcalib_ros.cli.arguments import make_parser
+from dashcalib_ros.cli.drive import read_config
+from dashcalib_ros.config import Config
 
 
 def run(capsys, *arguments):
@@ -16,6 +19,11 @@ def run(capsys, *arguments):
     out, err = capsys.readouterr()
     assert 'Traceback' not in err
     return code, out, err
+
+
+def test_the_number_of_its_processes_is_no_setting():
+    args = make_parser().parse_args(['batch', 'x.csv', '--out', 'y', '--workers', '3'])
+    assert args.workers == 3 and read_config(args) == Config()
 
 
 def test_a_fleet_is_calibrated_here_and_nothing_is_done_twice(tmp_path, capsys):

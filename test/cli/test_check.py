@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -13,14 +14,13 @@ from fakes import stands_in_for
 from made_calibration import MOUNT, TRUTH, make_calibration
 from made_drives import START, TIMES, drive, images, info_of, write_bag, write_timed
 
-from dashcalib_ros import session
+from dashcalib_ros import judge, session
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.cli import command, main
-from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.formats import result_json
-from dashcalib_ros.judge import Check, Odometry, Reading, watch
+from dashcalib_ros.judge import Check, Odometry, Reading
 from dashcalib_ros.judge.odometry import TurnOdometry, TurnPath
 from dashcalib_ros.pipeline import Calibrator
 from dashcalib_ros.problem.quadratic import Quadratic
@@ -37,33 +37,33 @@ class FakeCalibrator:
     fits = 5
 
     def __init__(self, config=None, mask=None, verbose=False):
-        pass
+        self.detection = SimpleNamespace(turns=tuple, lines=lambda: None,
+                                         resized=lambda camera: camera)
+        self.workers = SimpleNamespace(run=self._run)
+        self.scenes = SimpleNamespace(reconstructed=list)
+        self.solution = SimpleNamespace()
 
     def push(self, frame):
         pass
 
-    def turns(self):
-        return ()
-
     def calibrate(self, progress=None):
         return make_calibration(warnings=('dark',), mount=self.mount)
 
-    def check(self, given, calibration, progress=None, name='CALIBRATION'):
-        type(self).asked = given
-        return Check(self.answer, ('it is 0.2 px off',), 0.2, 0.5, PictureSigma(0.1, 0.2), 1.5,
-                     4.7, 0.001)
-
-    def odometry(self, given, poses, progress=None):
+    def _run(self, function, *given):
+        """Answer in a worker's place."""
+        if function is judge.check:
+            type(self).asked = given[0]
+            return Check(self.answer, ('it is 0.2 px off',), 0.2, 0.5, PictureSigma(0.1, 0.2),
+                         1.5, 4.7, 0.001)
+        if function is judge.readings_of:
+            return [Reading(TurnId.at(n), Quadratic.prior(100 * np.eye(6)), None, n < self.fits)
+                    for n in range(5)]
+        assert function is judge.beside_poses
         rotations, places = np.array([np.eye(3)] * 4), np.arange(12.0).reshape(4, 3)
         path = TurnPath(rotations, places)
         turn = TurnOdometry(TurnId.at(88), np.arange(4) * 10**8, path,
                             {'given': path, 'ours': path, 'guess': path})
         return Odometry(('given', 'ours', 'guess'), (turn,))
-
-    def watch(self, camera, sigma=None):
-        seen = [Reading(TurnId.at(n), Quadratic.prior(100 * np.eye(6)), None, n < self.fits)
-                for n in range(5)]
-        return watch(seen, camera, sigma, Config().monitor)
 
     def close(self):
         pass
@@ -235,7 +235,7 @@ def test_bad_input_is_one_line(files, capfd, arguments, match):
 def test_what_nobody_expected_is_no_answer(files, monkeypatch, capfd):
     def fail(*_):
         raise ZeroDivisionError('of a defect')
-    monkeypatch.setattr(FakeCalibrator, 'check', fail)
+    monkeypatch.setattr(FakeCalibrator, '_run', fail)
     monkeypatch.setattr(sys, 'argv', ['dashcalib', *files, '--verbose'])
     # Python's own exit code, 1, would be "wrong"
     with pytest.raises(SystemExit) as ended:

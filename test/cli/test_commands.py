@@ -11,6 +11,7 @@ import re
 import shutil
 import signal
 import sys
+import types
 from typing import ClassVar
 from unittest.mock import create_autospec
 
@@ -34,8 +35,10 @@ from dashcalib_ros.demo import Drive, Lens, demo_drive, render_to_bag
 from dashcalib_ros.detect.turn import Turn, TurnId
 from dashcalib_ros.errors import ConfigError, Notice, OutputError, WorkerError
 from dashcalib_ros.judge import Verdict
-from dashcalib_ros.pipeline import Calibrator, Outlook, Status
+from dashcalib_ros.judge.conclude import Outlook
+from dashcalib_ros.pipeline import Calibrator
 from dashcalib_ros.report import write_results
+from dashcalib_ros.selection import Status
 
 NAMES_OF_MODELS = [AUTO, *(model.model for model in calibrated_models())]
 
@@ -65,8 +68,13 @@ class FakeCalibrator:
         return Status(frames=self.frames, turns=self.frames // 2, built=0, yaw_deg=0.0,
                       magnitude=0.0, standing=False)
 
-    def turns(self):
-        return self.found
+    @property
+    def detection(self):
+        return types.SimpleNamespace(turns=lambda: self.found, finish=list)
+
+    @property
+    def scenes(self):
+        return types.SimpleNamespace(config=self.config)
 
     def calibrate(self, progress=None):
         progress('reconstructing', 0.5)
@@ -74,20 +82,28 @@ class FakeCalibrator:
             raise self.failure
         return make_calibration(self.level, config=self.config, warnings=(DARK,), input_name='')
 
-    def outlook(self, progress=None):
-        return Outlook(self.frames, self.found, self.yaws_deg, Verdict(
-            self.level, () if self.level == 'accepted' else
-            (Notice('E-A', 'few', 'drive'), Notice('E-B', 'less', 'park'))),
-            (), 0.0)
+    def reconstruct(self, progress, final):
+        return []
+
+    def evidence(self, started, sensors):
+        pass
 
     def close(self):
         self.closed = True
+
+    @classmethod
+    def _outlook(cls, scenes, evidence, config):
+        return Outlook(cls.made[-1].frames, cls.found, cls.yaws_deg, Verdict(
+            cls.level, () if cls.level == 'accepted' else
+            (Notice('E-A', 'few', 'drive'), Notice('E-B', 'less', 'park'))),
+            (), 0.0)
 
 
 @pytest.fixture
 def fake(monkeypatch):
     """Put the fake in the calibrator's place."""
     monkeypatch.setattr('dashcalib_ros.session.Calibrator', FakeCalibrator)
+    monkeypatch.setattr('dashcalib_ros.session.outlook', FakeCalibrator._outlook)
     monkeypatch.setattr(FakeCalibrator, 'made', [])
     return FakeCalibrator
 
@@ -205,10 +221,13 @@ def test_flags_win_over_set_which_wins_over_the_file(fake, drive, tmp_path):
     path = tmp_path / 'config.yaml'
     path.write_text('turns:\n  wanted: 2\n  half_width: 2\nseed: 3\nmotion.standing_px: 2e-1\n')
     assert main(['run', drive, '--config', str(path), '--set', 'turns.wanted=3', '--set',
-                 'turns.half_width=1e0', '--turns', '4', '--threads', '2', '--verbose']) == 0
+                 'turns.half_width=1e0', '--turns', '4', '--workers', '2', '--verbose']) == 0
     wanted = Config().replace({'turns.wanted': 4, 'turns.at_most': 4, 'turns.half_width': 1.0,
-                               'seed': 3, 'motion.standing_px': 0.2, 'threads': 2})
+                               'seed': 3, 'motion.standing_px': 0.2, 'workers': 2})
     assert fake.made[0].config == wanted and fake.made[0].verbose
+    # its earlier name
+    assert main(['run', drive, '--threads', '3']) == 0
+    assert fake.made[1].config.workers == 3
 
 
 @pytest.mark.parametrize('model', NAMES_OF_MODELS)

@@ -109,7 +109,7 @@ def test_an_unknown_argument_names_the_help_of_its_command(here):
     # no drive, and like no command
     (['camera.yaml'], 'E-COMMAND-UNKNOWN', 'run, turns, demo, compare, rig, export, check, batch'),
     (['run', 'x', '--fsp', '10'], 'E-ARGUMENT-UNKNOWN', 'did you mean --fps?'),
-    (['run', 'x', '--thread=2'], 'E-ARGUMENT-UNKNOWN', 'did you mean --threads?'),
+    (['run', 'x', '--worker=2'], 'E-ARGUMENT-UNKNOWN', 'did you mean --workers?'),
     (['run', 'x', '-fps', '2'], 'E-ARGUMENT-UNKNOWN', 'did you mean --fps?'),
     (['run', 'x', '-out', 'y'], 'E-ARGUMENT-UNKNOWN', 'did you mean -o or --out?'),
     (['run', ''], 'E-ARGUMENT-EMPTY', 'empty'), (['check', '', 'x'], 'E-ARGUMENT-EMPTY', ''),

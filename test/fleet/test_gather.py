@@ -32,7 +32,7 @@ def test_the_content_and_the_settings_are_the_identity(tmp_path):
     with pytest.raises((InputError, FileNotFoundError), match='gone'):
         content_hash(tmp_path / 'gone.avi')
     same = settings_hash(CONFIG, None, None)
-    assert settings_hash(CONFIG.replace({'verdict.max_sigma': 0.1, 'threads': 1}),
+    assert settings_hash(CONFIG.replace({'verdict.max_sigma': 0.1, 'workers': 1}),
                          None, None) == same
     assert len({same, settings_hash(CONFIG, 10.0, None), settings_hash(CONFIG, None, '/a'),
                 settings_hash(CONFIG.replace({'tracks.points': 700}), None, None)}) == 4

@@ -167,6 +167,13 @@ def test_a_result_reads_back(tmp_path):
     assert json.loads(path.read_text()) == result_dict(make_calibration('weak'))
 
 
+def test_a_result_with_the_earlier_name_of_a_setting_reads_back(tmp_path):
+    data = result_dict(make_calibration(config=Config.of({'workers': 3})))
+    data['config']['threads'] = data['config'].pop('workers')
+    (tmp_path / 'result.json').write_text(json.dumps(data))
+    assert load_calibration(tmp_path).config.workers == 3
+
+
 @pytest.mark.parametrize(('content', 'code'), [
     (b'{"verdict": ', 'E-JSON-INVALID'), (b'{"a": ' * 100000, 'E-JSON-INVALID'),
     (b'\xff\xfe\x00junk', 'E-FILE-NOT-TEXT'),

@@ -140,7 +140,7 @@ def test_a_query_of_a_database_ends(tmp_path, monkeypatch):
             f'{TOPICS} INSERT INTO topics {COUNTED.format(" LIMIT 500")} SELECT 1, n, "", "", "" '
             f'FROM c; CREATE TABLE messages(id, topic_id, timestamp, data); INSERT INTO messages '
             f'{COUNTED.format(" LIMIT 5000")} SELECT n, 1, n, x\'00\' FROM c;')
-    with bag_read.WITHIN_LIMIT, pytest.raises(Exception, match='interrupted'):
+    with bag_read.within_limit(), pytest.raises(Exception, match='interrupted'):
         bag_read._reader(tmp_path / 'odd.db3').open()
     fails('E-BAG-TYPE-MISSING', tmp_path / 'odd.db3')
 
@@ -153,7 +153,7 @@ def test_a_ros1_bag_s_index_names_each_chunk_once(tmp_path):
     place = data.index(b'chunk_count=') + 12
     count = int.from_bytes(data[place:place + 4], 'little') + 50
     file.write_bytes(data[:place] + count.to_bytes(4, 'little') + data[place + 4:] + 50 * record)
-    with bag_read.WITHIN_LIMIT, refused(InputError, 'E-BAG-INDEX', 'chunks overlap'):
+    with bag_read.within_limit(), refused(InputError, 'E-BAG-INDEX', 'chunks overlap'):
         bag_read._reader(file).open()
     same(list(open_frames(file)), drive(400))
 

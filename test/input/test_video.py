@@ -149,7 +149,7 @@ def test_a_contradicted_video_is_the_first_reason(tmp_path):
     path = write_timed(tmp_path / 'drive.mp4', np.arange(30) / 10)
     verdict = calibrate(path, fps=30).verdict
     assert verdict.codes[0] == 'E-INPUT-CONTRADICTED' and len(verdict.reasons) == 2
-    assert verdict.cures[0].startswith('omit --fps')
+    assert verdict.remedies[0].startswith('omit --fps')
     assert len(calibrate(path).verdict.reasons) == 1
 
 

@@ -59,7 +59,7 @@ def test_turned_pictures_are_named_first_with_the_way_back(solution, degrees, ba
     found = turned(on_a_road(solution), 2, degrees)
     verdict = judge(found, replace(CONFIG.verdict, min_turns=9))
     assert verdict.level == 'weak' and verdict.codes == (CODE, 'E-FEW-TURNS')
-    assert f'-vf {back} ' in verdict.cures[0]
+    assert f'-vf {back} ' in verdict.remedies[0]
     mounted_so = replace(CONFIG.verdict, max_roll_deg=180.0)
     assert judge(found, mounted_so).level == 'accepted'
 
@@ -113,7 +113,7 @@ def test_uneven_times_that_are_taken_as_even_ones_are_named(monkeypatch):
     found = solved(scenes_of(2, readout_s=0.03, uneven=0.48, **dense))
     codes = judge(found, CONFIG.verdict).codes
     assert codes[0] == MOVES and TIMES in codes
-    assert 'times.txt' in judge(found, CONFIG.verdict).cures[codes.index(TIMES)]
+    assert 'times.txt' in judge(found, CONFIG.verdict).remedies[codes.index(TIMES)]
     # true times are no even ones
     codes = judge(with_times(found, 0.002), CONFIG.verdict).codes
     assert codes[0] == MOVES and TIMES not in codes

@@ -48,7 +48,7 @@ def test_a_verdict_tells_it_with_the_first_cure(four):
     verdict = judge(four, NEEDS_MORE, outlook=True)
     assert verdict.level == 'weak'
     assert verdict.reasons[0].endswith(f' ({next_turn(four)})') and next_turn(four)
-    assert verdict.reasons[0].endswith(': ' + verdict.cures[0])
+    assert verdict.reasons[0].endswith(': ' + verdict.remedies[0])
 
 
 def test_where_something_contradicts_the_result_more_turns_are_no_cure(four):

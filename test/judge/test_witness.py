@@ -12,8 +12,8 @@ from synthetic import LENS, SIZE
 from dashcalib_ros import Config, open_frames
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.detect import Bend, LineCollector, bend
-from dashcalib_ros.judge import Check, with_lines
-from dashcalib_ros.judge.check import _lines_text
+from dashcalib_ros.judge import Check
+from dashcalib_ros.judge.check import _lines_text, with_lines
 from dashcalib_ros.judge.verdict import lines_contradict
 
 

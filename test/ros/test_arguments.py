@@ -50,6 +50,8 @@ def test_arguments():
     assert parse([]) == (False, set())
     assert parse(['--ros-args', '-p', 'a.b:=c', '--param', 'node:d:=e']) == (False, {'a.b', 'd'})
     assert parse(['--ros-args', '-p', 'help:=x', '--', '--help']) == (True, {'help'})
+    # by its earlier name
+    assert parse(['--ros-args', '-p', 'threads:=3']) == (False, {'workers'})
     for wrong in (['image_raw:=/camera'], ['--ros-args', '-r', 'a:=b', '--', '/camera'],
                   ['--lifecycle']):
         with pytest.raises(ConfigError, match='--ros-args') as raised:

@@ -22,12 +22,14 @@ from ros_desk import FIRST, SIGMA
 from sensor_msgs.msg import CameraInfo, RegionOfInterest
 from std_msgs.msg import Header
 
+from dashcalib_ros import judge
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.formats.ros import camera_of_message
-from dashcalib_ros.judge import Check, Reading, TurnSummary, Verdict, watch
-from dashcalib_ros.pipeline import Calibrator, Status
+from dashcalib_ros.input.scale import FULL_SIZE
+from dashcalib_ros.judge import Check, Reading, TurnSummary, Verdict
+from dashcalib_ros.pipeline import Calibrator
 from dashcalib_ros.problem.quadratic import Quadratic
 from dashcalib_ros.report import Calibration
 from dashcalib_ros.ros import background
@@ -35,7 +37,7 @@ from dashcalib_ros.ros import drive as drive_module
 from dashcalib_ros.ros.calibrate import camera_info
 from dashcalib_ros.ros.check import NOT_YET, flat_texts
 from dashcalib_ros.ros.images import LASTING
-from dashcalib_ros.selection import SceneSelection
+from dashcalib_ros.selection import SceneSelection, Status
 
 TOPIC = '/camera_info'
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
@@ -55,7 +57,10 @@ class Core:
     def __init__(self, config=None, mask=None, verbose=False, live=False, use_stored=True,
                  warn=None, inline=False, on_trouble=None, on_wait=None):
         self.ready, self.strangers, self.scenes = (), (), Scenes()
-        self.detection = SimpleNamespace(frames=1, start_s=0.0, straight_pairs=0)
+        self.scenes.core = self
+        self.detection = SimpleNamespace(frames=1, start_s=0.0, straight_pairs=0, scale=FULL_SIZE,
+                                         lines=lambda: None, resized=lambda camera: camera)
+        self.workers, self.solution = SimpleNamespace(run=self._run), None
         Core.newest = self
 
     def push(self, frame):
@@ -71,17 +76,18 @@ class Core:
         return Calibration(Verdict('accepted'), (320, 240), FIRST, SIGMA, turns, 10, 0.3, {}, {},
                            Config())
 
-    def check(self, given, calibration, progress=None):
-        right = given.fx == calibration.camera.fx
+    def _run(self, function, *given):
+        """Answer in a worker's place."""
+        if function is judge.readings_of:
+            return tuple(Reading(scene.turn, KNOWS, None, scene.turn not in self.strangers)
+                         for scene in given[0])
+        assert function is judge.check
+        given, right = given[0], given[0].fx == FIRST.fx
         if self.dark:
             return Check('cannot tell', ('too dark',))
         if self.near:
             return Check('differs', ('differs by 1.0 px, good enough',), 1.0, 2.0)
         return Check('right' if right else 'wrong', (f'fx {given.fx:.0f}',), 0.5, 1.0)
-
-    def watch(self, camera, sigma=None):
-        return watch((Reading(turn, KNOWS, None, turn not in self.strangers)
-                      for turn in self.ready), camera, sigma, Config().monitor)
 
     def close(self):
         pass
@@ -89,7 +95,12 @@ class Core:
 
 @stands_in_for(SceneSelection)
 class Scenes:
-    """In the SceneSelection's place: it has none."""
+    """In the SceneSelection's place: its core's turns."""
+
+    config = Config()
+
+    def reconstructed(self):
+        return [SimpleNamespace(turn=turn) for turn in self.core.ready]
 
     def forget_stored(self, but=frozenset()):
         pass

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import importlib.util
 import math
 import os
 import re
@@ -37,11 +38,14 @@ from dashcalib_ros.ros.interface import (
     SERVICES,
     SUBSCRIBED,
 )
-from dashcalib_ros.ros.page import page
 from dashcalib_ros.ros.parameters import declare, declared_names, given_parameters
-from dashcalib_ros.ros.settings import CHANGEABLE, NodeConfig, sample, specs
+from dashcalib_ros.ros.settings import CHANGEABLE, NodeConfig, specs
 
 COLCON = shutil.which('colcon')
+place = importlib.util.spec_from_file_location(
+    'docs_ros_interface', REPOSITORY / 'docs' / 'ros_interface.py')
+docs = importlib.util.module_from_spec(place)
+place.loader.exec_module(docs)
 # one drive, and the node, have no use for the settings of a fleet and of a rig
 CORE = {name: value for name, value in Config().flat().items()
         if not name.startswith(('fleet.', 'rig.'))}
@@ -62,9 +66,9 @@ def node_and_bench(ros_context, tmp_path_factory):
 
 
 def test_the_shipped_parameters_are_the_defaults():
-    """If this fails: python -m dashcalib_ros.ros.settings > config/calibrator.yaml."""
+    """If this fails: python docs/ros_interface.py."""
     text = (REPOSITORY / 'config' / 'calibrator.yaml').read_text()
-    assert text == sample()
+    assert text == docs.sample()
     values = yaml.safe_load(text)['/**']['ros__parameters']
     own = {spec.name: spec.default for spec in dataclasses.fields(NodeConfig)}
     experts = {name for name, spec in specs().items() if spec.metadata['expert']}
@@ -101,6 +105,12 @@ def read(arguments):
     finally:
         node.destroy_node()
         rclpy.shutdown()
+
+
+def test_a_parameter_may_have_its_earlier_name(ros_context):
+    with pytest.warns(FutureWarning, match='workers'):
+        settings, names = read(['-p', 'threads:=3'])
+    assert settings.core.workers == 3 and 'workers' in names and 'threads' not in names
 
 
 def test_a_file_may_have_full_names_or_sections(tmp_path, ros_context):
@@ -191,8 +201,8 @@ def test_what_users_set_fits_a_screen(ros_context):
 
 @pytest.mark.parametrize('program', ['calibrator', 'checker'])
 def test_the_page_of_the_interface_is_that_of_a_running_node(start_node, make_bench, program):
-    """If this fails: python -m dashcalib_ros.ros.page > docs/ros_interface.md."""
-    assert (REPOSITORY / 'docs' / 'ros_interface.md').read_text() == page()
+    """If this fails: python docs/ros_interface.py."""
+    assert (REPOSITORY / 'docs' / 'ros_interface.md').read_text() == docs.page()
     node, bench = start_node(command=[*QUICK_COMMAND, program]), make_bench(listen=False)
     bench.until(lambda: bench.images.get_subscription_count() > 0
                 and program in bench.node.get_node_names(), node=node)

@@ -12,13 +12,15 @@ import numpy as np
 import pytest
 from fakes import image_message, stands_in_for
 
+from dashcalib_ros import judge
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import WorkerError
-from dashcalib_ros.judge import Check, Reading, TurnSummary, Verdict, watch
+from dashcalib_ros.input.scale import FULL_SIZE
+from dashcalib_ros.judge import Check, Reading, TurnSummary, Verdict
 from dashcalib_ros.judge.calibration import StoredTurnSummary
-from dashcalib_ros.pipeline import Calibrator, Status
+from dashcalib_ros.pipeline import Calibrator
 from dashcalib_ros.problem.quadratic import Quadratic
 from dashcalib_ros.report import Calibration, NamedCamera
 from dashcalib_ros.ros import background as room
@@ -31,7 +33,7 @@ from dashcalib_ros.ros.background import (
     Trouble,
     Watched,
 )
-from dashcalib_ros.selection import SceneSelection
+from dashcalib_ros.selection import SceneSelection, Status
 
 LIMIT = 20.0
 CONFIG = Config().replace({'turns.wanted': 2})
@@ -61,11 +63,16 @@ class Core:
         self.hold.set()
         self.scenes = Scenes()
         self.scenes.core = self
+        self.workers = types.SimpleNamespace(run=self._run)
+        self.solution = None
         Core.made.append(self)
 
     @property
     def detection(self):
-        return types.SimpleNamespace(frames=self.frames, start_s=0.0, straight_pairs=self.pairs)
+        return types.SimpleNamespace(
+            frames=self.frames, start_s=0.0, straight_pairs=self.pairs, lines=lambda: None,
+            resized=lambda camera: camera, scale=FULL_SIZE, straights=lambda newest:
+            types.SimpleNamespace(stamps_s=np.array([50.0, 62.0])))
 
     def push(self, frame):
         self.frames += 1
@@ -99,20 +106,21 @@ class Core:
         return Calibration(Verdict('weak'), (64, 48), None, None, turns, 1, None, {}, {}, CONFIG,
                            stored_turns=stored)
 
-    def watch(self, camera, sigma=None):
-        self.watched.append((camera, self.ready))
+    def _run(self, function, *given):
+        """Answer in a worker's place."""
+        if function is judge.moved:
+            self.asked.append(self.pairs)
+            return (50.0, np.array([-1.0, 0.2])) if self.pairs > 70 else None
+        if function is judge.check:
+            self.checked.append(given[0])
+            return Check('right', ('it fits',), 0.5, 1.0)
+        assert function is judge.readings_of
+        turns = tuple(scene.turn for scene in given[0])
+        self.watched.append((given[1], turns))
         if Core.failures:
             raise Core.failures.pop()
-        return watch((Reading(turn, ZERO, None, explained=turn not in self.strangers)
-                      for turn in self.ready), camera, sigma, CONFIG.monitor)
-
-    def moved(self, camera, newest):
-        self.asked.append(self.pairs)
-        return (12.0, np.array([-1.0, 0.2])) if self.pairs > 70 else None
-
-    def check(self, given, calibration, progress=None):
-        self.checked.append(given)
-        return Check('right', ('it fits',), 0.5, 1.0)
+        return tuple(Reading(turn, ZERO, None, explained=turn not in self.strangers)
+                     for turn in turns)
 
     def close(self):
         self.closed.set()
@@ -122,6 +130,8 @@ class Core:
 @stands_in_for(SceneSelection)
 class Scenes:
     """In the SceneSelection's place: of such a core."""
+
+    config = CONFIG
 
     def want(self, turns, more=0, stretches=True):
         self.core.wanted, self.core.asks_stretches = turns + more, stretches
@@ -134,6 +144,9 @@ class Scenes:
 
     def forget_stored(self, but=frozenset()):
         self.core.done.append('forget')
+
+    def reconstructed(self):
+        return [types.SimpleNamespace(turn=turn) for turn in self.core.ready]
 
 
 @pytest.fixture
@@ -424,7 +437,7 @@ def test_new_turns_are_compared_with_the_camera_in_use_once(desk):
     core.ready = at(10, 20)
     until(lambda: len(desk.watched) == 2)
     time.sleep(2 * room.LOOK_S)
-    assert core.watched == [(CAMERA.camera, at(10)), (CAMERA.camera, at(10, 20))]
+    assert core.watched == [(CAMERA.camera, at(10)), (CAMERA.camera, at(20))]
     assert desk.watched[0].camera is CAMERA and core.calls == 0
 
 

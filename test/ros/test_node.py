@@ -257,13 +257,13 @@ def test_odd_stamps_are_counted_and_the_node_lives(start_node, make_bench):
     assert node.stop() == 0 and 'Traceback' not in node.text
 
 
-@pytest.mark.parametrize(('reliable', 'compressed', 'options', 'cures'), [
+@pytest.mark.parametrize(('reliable', 'compressed', 'options', 'remedies'), [
     (True, False, {}, ()),
     (True, False, {'reliability': 'best_effort'}, ('to auto', 'publish compressed', '.xml')),
     (False, False, {}, ('publish reliable', 'publish compressed', '.xml')),
     (False, True, {'image_transport': 'compressed'}, ('publish reliable',))])
 def test_lost_images_name_only_cures_that_are_not_in_use(start_node, make_bench, reliable,
-                                                         compressed, options, cures):
+                                                         compressed, options, remedies):
     node = start_node(**options)
     kind = {'topic': 'image_raw/compressed', 'image_type': CompressedImage} if compressed else {}
     camera = make_bench(reliable=reliable, **kind)
@@ -276,7 +276,7 @@ def test_lost_images_name_only_cures_that_are_not_in_use(start_node, make_bench,
     line, = [line for line in node.text.splitlines() if 'images are lost' in line]
     found = [each for each in ('to auto', 'publish reliable', 'publish compressed', '.xml')
              if each in line]
-    assert found == list(cures), line
+    assert found == list(remedies), line
     # the driver itself may be the cause
     assert 'driver skips images' in line
 

@@ -8,11 +8,11 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import Notice
 from dashcalib_ros.judge import TurnSummary, Verdict
-from dashcalib_ros.pipeline import Status
 from dashcalib_ros.report import Calibration
 from dashcalib_ros.report.turns import BACK, LEFT, RIGHT
 from dashcalib_ros.ros.background import beginning, new_turns, seen
 from dashcalib_ros.ros.state import outcome_text
+from dashcalib_ros.selection import Status
 
 
 def status(*turns, ways=()):

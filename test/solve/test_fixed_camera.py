@@ -65,7 +65,7 @@ def test_a_stabilised_video_is_found_and_taken_out():
     strongest = kept.fixed_camera[0]
     assert strongest.kind == 'shift' and strongest.clear
     assert 'E-PICTURE-MOVES' in judge(kept, CONFIG.verdict).codes
-    assert STEADY in judge(kept, CONFIG.verdict).cures
+    assert STEADY in judge(kept, CONFIG.verdict).remedies
     wrong, left = (mapping_error(each.camera, LENS) for each in (kept, found))
     assert wrong > 1.0 and left < 0.4
     assert not found.fixed_camera[0].clear
@@ -74,7 +74,7 @@ def test_a_stabilised_video_is_found_and_taken_out():
     assert found.sigma[2] > 2.0
     # the lens is told, but no camera_info holds for pictures that move
     verdict = judge(found, CONFIG.verdict)
-    assert verdict.level == 'weak' and verdict.cures[0] == STEADY
+    assert verdict.level == 'weak' and verdict.remedies[0] == STEADY
     assert verdict.codes[0] == 'E-PICTURE-MOVES'
     assert re.search(r'by up to \d+\.\d %', verdict.reasons[0])
     # ... also before what refuses it; what is less than the picture is known by does no harm
@@ -144,7 +144,7 @@ def test_a_windscreen_that_bends_the_picture_is_named():
     verdict = judge(solution, CONFIG.verdict)
     assert verdict.level != 'accepted' and 'E-PICTURE-BENT' in verdict.codes
     # nobody takes a windscreen away
-    assert 'dashcalib export --to rays' in ' '.join(verdict.cures)
+    assert 'dashcalib export --to rays' in ' '.join(verdict.remedies)
 
 
 @pytest.mark.thorough

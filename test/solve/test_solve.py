@@ -567,7 +567,7 @@ def test_the_outlook_counts_turns_and_angles_as_the_verdict_does(good):
     seen, limits = evidence_for(good), CONFIG.verdict
 
     def codes(scenes, **changes):
-        found = outlook(scenes, replace(seen, **changes), limits)
+        found = outlook(scenes, replace(seen, **changes), limits).verdict
         return found.level, found.codes
     assert codes(good.scenes) == ('accepted', ())
     assert codes(good.scenes[:1]) == ('weak', ('E-FEW-TURNS',))

@@ -47,7 +47,7 @@ def trouble() -> list[str]:
 def make_pool(threads: int = 2, make_worker: Callable[[], Worker] = ChildWorker,
               load: Callable[[], object] = child_tasks.pid, **options: Any) -> ScenePool:
     """Make a pool whose workers load nothing large."""
-    return ScenePool(Config().replace({'threads': threads}), make_worker, load, **options)
+    return ScenePool(Config().replace({'workers': threads}), make_worker, load, **options)
 
 
 @pytest.fixture
@@ -139,17 +139,18 @@ def test_a_turn_whose_child_is_killed_from_outside_is_built_again(
 def test_a_turn_that_kills_every_child_is_given_up_and_told(monkeypatch, tmp_path):
     log, told = tmp_path / 'log', []
     use(monkeypatch, child_tasks.build_dies)
-    pool = make_pool(on_lost=told.append)
+    pool = make_pool(on_trouble=told.append)
     pool.submit(turn(10, log), None)
     wait_until_built(pool)
     assert pool.scenes() == {at(10): None}
-    assert len(told) == 1 and 'turn at frame 10' in told[0]
+    assert [each.code for each in pool.lost] == ['E-TURN-LEFT-OUT'] and told[-1] == pool.lost[0]
+    assert 'turn at frame 10' in told[-1]
     assert log.read_text() == '10\n' * ATTEMPTS
     # the others still are built
     use(monkeypatch, child_tasks.build)
     pool.submit(turn(50), None)
     wait_until_built(pool)
-    assert pool.scenes() == {at(10): None, at(50): 'scene of 50'} and len(told) == 1
+    assert pool.scenes() == {at(10): None, at(50): 'scene of 50'} and len(pool.lost) == 1
     pool.close()
 
 
@@ -194,8 +195,6 @@ def test_scenes_of_turns_that_left_are_dropped(pool, monkeypatch, tmp_path):
     wait_for((tmp_path / 'flag.90').exists)
     pool.keep_only({at(50)})
     assert len(pool.unbuilt()) == 0
-    pool.reject(at(50))
-    assert pool.scenes() == {at(50): None}
 
 
 def test_the_most_prominent_is_built_first_and_the_queue_has_an_end(monkeypatch, tmp_path):
