@@ -187,8 +187,8 @@ class Calibrator(AbstractContextManager['Calibrator']):
 
     @property
     def _temperature(self) -> Samples | None:
-        sensors = self._warmth, self._motion
-        return spared('the temperature', self._lost, temperature_of, sensors, self.detection.start_s)
+        return spared('the temperature', self._lost, temperature_of, (self._warmth, self._motion),
+                      self.detection.start_s)
 
     def evidence(self, started: float, sensors: SensorComparison) -> Evidence:
         """Return what a result needs beside the solution. started: s of time.monotonic()."""
