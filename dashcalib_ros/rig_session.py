@@ -26,21 +26,10 @@ from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.pipeline import Calibrator
 from dashcalib_ros.report import Calibration
 from dashcalib_ros.rig.dense import Retraced, retraced
-from dashcalib_ros.rig.joint import Solved, solved
+from dashcalib_ros.rig.joint import Solved
 from dashcalib_ros.rig.paths import CameraPaths, camera_paths, coarse_paths, ordered
-from dashcalib_ros.rig.placed import (
-    PlacedCamera,
-    RigCalibration,
-    apart_doubts,
-    base_camera,
-    base_doubts,
-    lens_doubts,
-    misnamed,
-    not_placed,
-    placed,
-    why_not_aligned,
-)
-from dashcalib_ros.rig.start import Aligned, Metres, aligned, problem_of
+from dashcalib_ros.rig.placed import Alone, RigCalibration, rig_of_paths
+from dashcalib_ros.rig.start import Aligned, Metres, aligned
 from dashcalib_ros.rig.witness import (
     Epipolar,
     Fitted,
@@ -135,32 +124,12 @@ def rig_of_drives(drives: Mapping[str, Recording], base: str | None = None,
         paths = again.paths(pool, observer)
         matches = again.matches(pool)
     observer.show('placing the cameras', None)
-    metres = _metres(learned[base])
-    problem = problem_of(paths, base, kept, metres)
-    best = solved(problem) if problem.pairs else None
-    doubts = {name: lens_doubts(name, each.calibration.verdict.level)
-              for name, each in learned.items()}
-    cameras: dict[str, PlacedCamera] = {}
-    witness: Mapping[tuple[str, str], Epipolar] = {}
-    if best is not None:
-        for name in best.problem.lenses:
-            doubts[name] += apart_doubts(name, best)
-        witness, contradicted = _witnessed(learned, best, matches)
-        doubts = {name: (*each, *contradicted.get(name, ())) for name, each in doubts.items()}
-    for name in drives:
-        if name == base:
-            cameras[name] = base_camera(place(name), doubts[name])
-        elif best is None or name not in best.problem.places:
-            cameras[name] = not_placed(place(name), why_not_aligned(
-                name, base, turned[name], len(found[name].scenes)))
-        else:
-            cameras[name] = placed(
-                name, place(name), best, metres is not None,
-                learned[name].start_s - learned[base].start_s, config.rig,
-                (*doubts[name], *base_doubts(name, base, doubts[base])))
+    alone = {name: Alone(place(name), each.calibration.verdict.level, each.start_s,
+                         len(found[name].scenes)) for name, each in learned.items()}
     mount = learned[base].calibration.mount
-    warnings = () if mount is None else misnamed(cameras, mount.rotation)
-    return Rig(RigCalibration(base, cameras, witness, warnings),
+    return Rig(rig_of_paths(alone, base, turned, paths, _metres(learned[base]), config.rig,
+                            lambda best: _witnessed(learned, best, matches),
+                            None if mount is None else mount.rotation),
                {name: each.calibration for name, each in learned.items()})
 
 

@@ -127,7 +127,7 @@ def reason(words):
 
 def node_arguments(words):
     """Return the program, and what a command gives to it; None if it starts no node."""
-    for program in ('calibrator', 'checker'):
+    for program in ('calibrator', 'checker', 'rig'):
         for start in ([f'dashcalib-{program}'], ['ros2', 'run', 'dashcalib_ros', program]):
             if words[:len(start)] == start:
                 return [program, *words[len(start):]]

@@ -17,6 +17,7 @@ from dashcalib_ros.formats import load_camera
 from dashcalib_ros.formats.rig import RIG_FORMATS, load_rig
 from dashcalib_ros.input.motion import Samples, SensorStream
 from dashcalib_ros.judge import Verdict
+from dashcalib_ros.rig.live import rig_of_scenes
 
 BACK = replace(SPEC, rolling_shutter_ms=12.0, mounting=Mounting(
     178.0, -3.0, 1.0, -0.9, -0.1, 1.2, phase_s=0.05, late_s=0.3))
@@ -83,6 +84,26 @@ def test_every_image_is_posed_as_its_shutter_saw_it(placed):
         off = np.degrees(rotation_vectors(found @ truth.transpose(0, 2, 1)))
         # bumps pitch the car while rows are exposed, at rates that no two poses tell
         assert len(rows) > 25 and np.sqrt(np.mean(off**2, axis=0)).max() < 0.007
+
+
+def test_turns_without_their_images_show_it_too(placed):
+    """As a live drive has them: less is known, and the sigmas say so."""
+    found, drives, kept = placed
+    scenes = {name: solution.scenes for name, (_, solution, *_) in kept.items()}
+    rig = rig_of_scenes(scenes, dict.fromkeys(scenes, 'accepted'), 'front', 0.0, None, QUICK)
+    true, rear = true_places(drives, 'front')['rear'], rig.cameras['rear']
+    off = np.degrees(rotation_vectors((rear.rotation @ true.rotation.T)[None])[0])
+    assert np.all(np.abs(off) < 3.5 * np.array(rear.rotation_sigma_deg))
+    assert max(rear.rotation_sigma_deg) < 0.3 and rear.verdict == 'accepted'
+    assert abs(rear.time_offset_s - true.time_offset_s) < 3.5 * rear.time_sigma_s < 0.01
+    # with the turns of later than both, nothing shows where it sits
+    later = max(int(scene.tracks.stamps_ns[-1]) for scene in scenes['front']) / 1e9
+    rig = rig_of_scenes(scenes, dict.fromkeys(scenes, 'accepted'), 'front', later, None, QUICK)
+    assert [each.code for each in rig.cameras['rear'].reasons] == ['E-RIG-NO-SCENES']
+    # of one camera alone
+    rig = rig_of_scenes({**scenes, 'rear': ()}, dict.fromkeys(scenes, 'weak'), 'front', 0.0, None,
+                        QUICK)
+    assert rig.cameras['rear'].verdict == 'refused' and rig.cameras['front'].verdict == 'weak'
 
 
 def test_a_rig_is_written_for_all_who_take_it(placed, tmp_path):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -16,8 +16,9 @@ from dashcalib_ros.config import RigConfig
 from dashcalib_ros.errors import Notice
 from dashcalib_ros.judge.calibration import Level
 from dashcalib_ros.judge.difference import limit_of
-from dashcalib_ros.rig.joint import REACH_M, Solved
-from dashcalib_ros.rig.start import LEAST_EXPLAINED, Aligned
+from dashcalib_ros.rig.joint import REACH_M, Solved, solved
+from dashcalib_ros.rig.paths import CameraPaths
+from dashcalib_ros.rig.start import LEAST_EXPLAINED, Aligned, Metres, problem_of
 from dashcalib_ros.rig.witness import Epipolar
 
 Sight = Literal['accepted', 'weak', 'not visible']
@@ -95,6 +96,57 @@ class RigCalibration:
     def accepted(self) -> bool:
         """Return whether the place of every camera is accepted."""
         return all(camera.verdict == 'accepted' for camera in self.cameras.values())
+
+
+@dataclass(frozen=True)
+class Alone:
+    """What is known of a camera without the others. calibration: the path of its result.
+
+    level: of its lens. start_s: stamp of its first image. scenes: how many may say where it sits.
+    """
+
+    calibration: str
+    level: Level
+    start_s: float
+    scenes: int
+
+
+# from a solved rig: what its cameras see together, and what of that contradicts a camera's place
+Witnessed = Callable[[Solved], tuple[Mapping[tuple[str, str], Epipolar],
+                                     Mapping[str, tuple[Notice, ...]]]]
+
+
+def rig_of_paths(alone: Mapping[str, Alone], base: str, turned: Mapping[str, Aligned | None],
+                 paths: Mapping[str, CameraPaths], metres: Metres | None, limits: RigConfig,
+                 witnessed: Witnessed = lambda best: ({}, {}), car: Floats | None = None
+                 ) -> RigCalibration:
+    """Return where the cameras of one car sit.
+
+    turned: of each but the base, how its turning fits to the base's. metres: None: unknown. car:
+    (3, 3) from the base's optical axes to the car's; None: unknown.
+    """
+    kept = {name: each for name, each in turned.items() if each is not None and each.found}
+    problem = problem_of(paths, base, kept, metres)
+    best = solved(problem) if problem.pairs else None
+    doubts = {name: lens_doubts(name, each.level) for name, each in alone.items()}
+    witness: Mapping[tuple[str, str], Epipolar] = {}
+    if best is not None:
+        witness, contradicted = witnessed(best)
+        doubts = {name: (*each, *(apart_doubts(name, best) if name in best.problem.lenses else ()),
+                         *contradicted.get(name, ())) for name, each in doubts.items()}
+    cameras: dict[str, PlacedCamera] = {}
+    for name, own in alone.items():
+        if name == base:
+            cameras[name] = base_camera(own.calibration, doubts[name])
+        elif best is None or name not in best.problem.places:
+            cameras[name] = not_placed(own.calibration, why_not_aligned(
+                name, base, turned.get(name), own.scenes))
+        else:
+            cameras[name] = placed(
+                name, own.calibration, best, metres is not None, own.start_s - alone[base].start_s,
+                limits, (*doubts[name], *base_doubts(name, base, doubts[base])))
+    return RigCalibration(base, cameras, witness,
+                          () if car is None else misnamed(cameras, car))
 
 
 def lens_doubts(name: str, level: Level) -> tuple[Notice, ...]:
