@@ -21,8 +21,9 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.errors import InputError, Notice
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.inputs import Paths
-from dashcalib_ros.input.motion import speeds_of
+from dashcalib_ros.input.motion import Samples, speeds_of
 from dashcalib_ros.input.scale import Scale
+from dashcalib_ros.judge.calibration import Level
 from dashcalib_ros.pipeline import Calibrator
 from dashcalib_ros.report import Calibration
 from dashcalib_ros.rig.dense import Retraced, retraced
@@ -104,16 +105,18 @@ def rig_of_drives(drives: Mapping[str, Recording], base: str | None = None,
     """Calibrate the cameras of one car, and where each sits.
 
     drives: by the cameras' names. base: the name of the camera that the others are placed
-    against; None: the first. place: of a camera's result, for the file. Raises InputError.
+    against; None: the first one whose lens is accepted. place: of a camera's result, for the file.
+    Raises InputError.
     """
     config, observer = config or Config(), observer or Observer()
-    base = base or next(iter(drives))
-    if base not in drives or len(drives) < 2:
+    if base not in (None, *drives) or len(drives) < 2:
         raise InputError('E-RIG-CAMERAS', f'a rig needs two cameras, and its base, {base}, is one '
                          f'of them: name them as front=front.mp4 left=left.mp4')
     learned = {name: _learn(name, drive, config, observer) for name, drive in drives.items()}
     found = {name: coarse_paths(name, each.solution, each.start_s)
              for name, each in learned.items()}
+    base = base or _first({name: each.calibration.verdict.level
+                           for name, each in learned.items()})
     turned = {name: aligned(found[name], found[base], _clock(learned, name, base))
               for name in drives if name != base}
     kept = {name: each for name, each in turned.items() if each is not None and each.found}
@@ -127,7 +130,7 @@ def rig_of_drives(drives: Mapping[str, Recording], base: str | None = None,
     alone = {name: Alone(place(name), each.calibration.verdict.level, each.start_s,
                          len(found[name].scenes)) for name, each in learned.items()}
     mount = learned[base].calibration.mount
-    return Rig(rig_of_paths(alone, base, turned, paths, _metres(learned[base]), config.rig,
+    return Rig(rig_of_paths(alone, base, turned, paths, _metres(learned, again.late), config.rig,
                             lambda best: _witnessed(learned, best, matches),
                             None if mount is None else mount.rotation),
                {name: each.calibration for name, each in learned.items()})
@@ -146,6 +149,11 @@ def _learn(name: str, drive: Recording, config: Config, observer: Observer) -> L
 def _kept(drive: Recording, calibration: Calibration, calibrator: Calibrator) -> Learned:
     return Learned(drive, calibration, calibrator.solution, calibrator.detection.scale,
                    calibrator.detection.valid())
+
+
+def _first(levels: Mapping[str, Level]) -> str:
+    """Return the first camera of the best lenses: one that is refused keeps no other one."""
+    return min(levels, key=lambda name: ('accepted', 'weak', 'refused').index(levels[name]))
 
 
 def _clock(learned: Mapping[str, Learned], name: str, base: str) -> float:
@@ -170,17 +178,20 @@ def _load() -> None:
 
 
 class _Again:
-    """The second reading of the drives: the images of stretches that are shared."""
+    """The second reading of the drives: the images of stretches that are shared.
+
+    late: of the clocks of the cameras that are aligned, against the base's, s.
+    """
 
     def __init__(self, learned: Mapping[str, Learned], base: str,
                  found: Mapping[str, CameraPaths], kept: Mapping[str, Aligned],
                  config: Config) -> None:
         self._learned, self._base, self._config = learned, base, config
-        self._late = {base: 0.0} | {name: each.late_s for name, each in kept.items()}
+        self.late = {base: 0.0} | {name: each.late_s for name, each in kept.items()}
         self._rotations = {base: np.eye(3)} | {
             name: each.rotation for name, each in kept.items()}
         spans = {name: [(scene.seconds[0] - late, scene.seconds[-1] - late)
-                        for scene in found[name].scenes] for name, late in self._late.items()}
+                        for scene in found[name].scenes] for name, late in self.late.items()}
         others = {name: [span for other in spans if other != name
                          and self._base in (name, other) for span in spans[other]]
                   for name in spans}
@@ -193,7 +204,7 @@ class _Again:
 
     def read(self) -> None:
         """Read the drives."""
-        for name, late in self._late.items():
+        for name, late in self.late.items():
             each = self._learned[name]
             wanted = {n: self._spans[name][n] for n in self._shared[name]}
             last = max((end for _, end in wanted.values()), default=-np.inf)
@@ -214,7 +225,7 @@ class _Again:
 
     def _seconds(self, name: str, frame: Frame) -> float:
         each = self._learned[name]
-        return float(frame.stamp_ns / 1e9 - each.start_s - self._late[name])
+        return float(frame.stamp_ns / 1e9 - each.start_s - self.late[name])
 
     def paths(self, pool: ScenePool, observer: Observer) -> dict[str, CameraPaths]:
         """Return the paths of the cameras, with the pose of every image."""
@@ -225,7 +236,7 @@ class _Again:
             scene = ordered(each.solution)[n]
             calls[name, n] = pool.begin(
                 retraced, list(frames.values()), scene, each.solution, self._config, each.valid)
-        stretches: dict[str, list[Retraced]] = {name: [] for name in self._late}
+        stretches: dict[str, list[Retraced]] = {name: [] for name in self.late}
         for number, ((name, _), call) in enumerate(calls.items()):
             observer.show('retracing the stretches that cameras share', number / len(calls))
             stretch = pool.result(call)
@@ -299,14 +310,18 @@ def _contradicted(free: Fitted, across: Floats, best: Solved, a: str, b: str) ->
     return float(np.linalg.norm(away)) if beyond.any() else 0.0
 
 
-def _metres(each: Learned) -> Metres | None:
-    """Return the speed of the car, where the drive has one."""
-    if each.drive.motion is None:
-        return None
-    speed = speeds_of(each.drive.motion.since(each.start_s))
-    if speed is None:
-        return None
-    return lambda seconds: speed.at(seconds)[:, 0]
+def _metres(learned: Mapping[str, Learned], late: Mapping[str, float]) -> Metres | None:
+    """Return the speed of the car, where a drive has one. late: of clocks, the base's first."""
+    for name, offset in late.items():
+        each = learned[name]
+        speed = each.drive.motion and speeds_of(each.drive.motion.since(each.start_s))
+        if speed:
+            return _speed(speed, offset)
+    return None
+
+
+def _speed(speed: Samples, offset: float) -> Metres:
+    return lambda seconds: speed.at(seconds + offset)[:, 0]
 
 
 # for Python ---------------------------------------------------------------------------------
@@ -320,11 +335,12 @@ def calibrate_rig(drives: Mapping[str, Paths | Recording], base: str | None = No
     drives: by the cameras' names: a bag, a video, a folder of images, or several files of one
     drive; 'BAG:TOPIC' for one topic of a bag. Every camera may have its own size, rate, lens,
     shutter and clock.
-    base: the camera that the others are placed against; None: the first.
+    base: the camera that the others are placed against; None: the first one with the best lens.
     fps: images per second of a folder without times, or instead of a video's rate.
     config: the settings: a Config, or a mapping such as {'turns.wanted': 8}; None: the defaults.
-    motion: data of the car's own sensors on the clock of the base: the path of a CSV, a GPX file
-    or a KITTI oxts folder, or a stream; with a speed translations are in metres.
+    motion: data of the car's own sensors on the clock of the base, or of the first camera: the
+    path of a CSV, a GPX file or a KITTI oxts folder, or a stream; with a speed translations are in
+    metres.
     progress: called with the name of a stage and its fraction done, 0 to 1; at last 'done', 1.0.
 
     Returns a Rig: its rig has a PlacedCamera for each name, with a verdict for each degree of
@@ -333,9 +349,9 @@ def calibrate_rig(drives: Mapping[str, Paths | Recording], base: str | None = No
     cannot run.
     """
     settings = settings_of(config, None)
-    base = base or next(iter(drives), '')
+    clock = base or next(iter(drives), '')
     opened = {name: path if isinstance(path, Recording) else open_camera(
-        path, fps, motion if name == base else None) for name, path in drives.items()}
+        path, fps, motion if name == clock else None) for name, path in drives.items()}
     with Calls(progress) as observer:
         return rig_of_drives(opened, base, settings, observer)
 

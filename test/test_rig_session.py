@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from shared_drive import LENS, QUICK, SPEC
+from solving import remembered
 
 from dashcalib_ros import rig_session
 from dashcalib_ros.camera.rotation import rotation_vectors
@@ -17,6 +18,7 @@ from dashcalib_ros.formats import load_camera
 from dashcalib_ros.formats.rig import RIG_FORMATS, load_rig
 from dashcalib_ros.input.motion import Samples, SensorStream
 from dashcalib_ros.judge import Verdict
+from dashcalib_ros.rig import live
 from dashcalib_ros.rig.live import rig_of_scenes
 
 BACK = replace(SPEC, rolling_shutter_ms=12.0, mounting=Mounting(
@@ -60,6 +62,12 @@ def test_pictures_show_where_a_camera_sits(placed):
     assert [each.mount.rear for each in found.calibrations.values()] == [False, True]
 
 
+def test_the_base_is_the_first_camera_whose_lens_is_accepted():
+    assert rig_session._first({'front': 'refused', 'left': 'weak', 'rear': 'accepted'}) == 'rear'
+    assert rig_session._first({'front': 'accepted', 'left': 'accepted'}) == 'front'
+    assert rig_session._first({'front': 'refused', 'left': 'weak', 'rear': 'weak'}) == 'left'
+
+
 def test_a_lens_and_its_verdict_stay_together(placed):
     found, _, kept = placed
     for name, (_, solution, *_) in kept.items():
@@ -86,9 +94,10 @@ def test_every_image_is_posed_as_its_shutter_saw_it(placed):
         assert len(rows) > 25 and np.sqrt(np.mean(off**2, axis=0)).max() < 0.007
 
 
-def test_turns_without_their_images_show_it_too(placed):
+def test_turns_without_their_images_show_it_too(placed, monkeypatch):
     """As a live drive has them: less is known, and the sigmas say so."""
-    found, drives, kept = placed
+    monkeypatch.setattr(live, '_solved', remembered(live._solved))
+    _, drives, kept = placed
     scenes = {name: solution.scenes for name, (_, solution, *_) in kept.items()}
     rig = rig_of_scenes(scenes, dict.fromkeys(scenes, 'accepted'), 'front', 0.0, None, QUICK)
     true, rear = true_places(drives, 'front')['rear'], rig.cameras['rear']

@@ -370,7 +370,7 @@ COMMANDS = {
                          'help': f'a camera, and {INPUT_HELP}; BAG:TOPIC for one topic of a bag'}),
             ('--base', {'metavar': 'NAME',
                         'help': 'the camera that the others are placed against (default: the '
-                                'first)'}),
+                                'first one whose lens is accepted)'}),
             ('--fps', {'type': POSITIVE, 'metavar': 'F',
                        'help': 'images per second of videos or image folders'}),
             ('--motion', {'type': Path, 'metavar': 'FILE',

@@ -22,13 +22,13 @@ from dashcalib_ros.standard_streams import write_stdout
 def rig(args: argparse.Namespace) -> int:
     """Place the cameras, write rig.json and their results; return the exit code."""
     config, inputs = read_config(args), named(args.cameras)
-    base = args.base or next(iter(inputs))
-    drives = {name: open_camera(path, args.fps, args.motion if name == base else None)
+    clock = args.base or next(iter(inputs))
+    drives = {name: open_camera(path, args.fps, args.motion if name == clock else None)
               for name, path in inputs.items()}
     screen = Screen(args.quiet, to_stderr=args.json)
     with output_folder(args.out):
         with Stages(args.quiet) as stages:
-            found = rig_of_drives(drives, base, config, stages)
+            found = rig_of_drives(drives, args.base, config, stages)
         write_rig(found, args.out)
     warn((*found.rig.warnings, *(
         reason for camera in found.rig.cameras.values() for reason in camera.reasons)))

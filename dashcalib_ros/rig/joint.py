@@ -38,8 +38,8 @@ PLACE, GAUGE = 8, 7
 # one sigma of priors. m: cameras of a car are not farther apart. log: of the metres of a scene's
 # unit, where no speed is known. Of time: quartz clocks differ by less
 REACH_M, UNKNOWN_UNIT, PACE = 2.0, 0.7, 1e-4
-# steps of the problem; before some of them the noise is weighed anew
-STEPS, WEIGHED = 12, (3, 6)
+# steps of the problem at the most; before some of them the noise is weighed anew
+STEPS, WEIGHED = 30, (3, 6)
 # of steps, in sigmas; below it they end
 SETTLED = 0.02
 # s: noise between keyframes is that of knots so far apart, times the square of how far they are
@@ -351,13 +351,15 @@ class Solved:
     """The optimum given each camera's own lens. covariance: (m, m); own: by camera, by group.
 
     Of a group these are (PLACE,) how far it is off all, and (PLACE,) its variances.
-    lens_distance: by camera, by how many of its own sigmas paths would move its lens.
+    lens_distance: by camera, by how many of its own sigmas paths would move its lens. settled:
+    whether the steps came to an end.
     """
 
     problem: Problem
     covariance: Floats
     own: Mapping[str, Sequence[tuple[Floats, Floats]]]
     lens_distance: Mapping[str, float]
+    settled: bool = True
 
     def sigma(self, name: str) -> Floats:
         """Return (PLACE,) the sigmas of a camera, larger where its stretches differ by more."""
@@ -377,6 +379,7 @@ class Solved:
 
 def solved(problem: Problem) -> Solved:
     """Return the optimum of a problem near it."""
+    settled = False
     for number in range(STEPS):
         groups = [problem.linearised(members) for members in problem.groups]
         if number in WEIGHED:
@@ -386,7 +389,8 @@ def solved(problem: Problem) -> Solved:
             groups = [rows.without_outliers(problem.noise, step) for rows in groups]
             step, information, _ = _step(problem, groups)
         problem = problem.moved(_shortened(problem, step))
-        if number > max(WEIGHED) and step @ information @ step < SETTLED**2:
+        settled = bool(number > max(WEIGHED) and step @ information @ step < SETTLED**2)
+        if settled:
             break
     prior, _ = problem.prior()
     covariance = np.asarray(np.linalg.inv(information), np.float64)
@@ -402,7 +406,7 @@ def solved(problem: Problem) -> Solved:
             own[name].append((away[place], np.diag(alone)[place]))
     distances = {name: distance(value, problem.cameras[name].lens_covariance)
                  for name, value in problem.lenses.items()}
-    return Solved(*_with_own_lenses(problem, covariance), own, distances)
+    return Solved(*_with_own_lenses(problem, covariance), own, distances, settled)
 
 
 def _with_own_lenses(problem: Problem, covariance: Floats) -> tuple[Problem, Floats]:
@@ -454,11 +458,13 @@ def _weighed(problem: Problem, groups: Sequence[Rows]) -> Noise:
     return Noise(*sizes.tolist())
 
 
-# rad, m, logarithms: the farthest a step goes
+# rad, s, logarithms: the farthest a step goes; of metres all is linear
 LONGEST = 0.5
+METRES = slice(3, 6)
 
 
 def _shortened(problem: Problem, step: Floats) -> Floats:
-    places = [step[place] for name, place in problem.where.items() if name[0] != 'lens']
+    places = [np.delete(step[place], METRES) for name, place in problem.where.items()
+              if name[0] != 'lens']
     return np.asarray(step * min(1.0, LONGEST / max(float(np.abs(np.concatenate(places)).max()),
                                                     1e-12)))

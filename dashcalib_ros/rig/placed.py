@@ -125,22 +125,26 @@ def rig_of_paths(alone: Mapping[str, Alone], base: str, turned: Mapping[str, Ali
     turned: of each but the base, how its turning fits to the base's. metres: None: unknown. car:
     (3, 3) from the base's optical axes to the car's; None: unknown.
     """
-    kept = {name: each for name, each in turned.items() if each is not None and each.found}
-    problem = problem_of(paths, base, kept, metres)
-    best = solved(problem) if problem.pairs else None
+    seen = {name for name, each in paths.items() if each.scenes}
+    kept = {name: each for name, each in turned.items()
+            if each is not None and each.found and {base, name} <= seen}
+    problem = problem_of(paths, base, kept, metres) if kept else None
+    best = solved(problem) if problem and problem.pairs else None
     doubts = {name: lens_doubts(name, each.level) for name, each in alone.items()}
     witness: Mapping[tuple[str, str], Epipolar] = {}
     if best is not None:
         witness, contradicted = witnessed(best)
         doubts = {name: (*each, *(apart_doubts(name, best) if name in best.problem.lenses else ()),
-                         *contradicted.get(name, ())) for name, each in doubts.items()}
+                         *unsettled_doubts(name, best), *contradicted.get(name, ()))
+                  for name, each in doubts.items()}
     cameras: dict[str, PlacedCamera] = {}
     for name, own in alone.items():
         if name == base:
             cameras[name] = base_camera(own.calibration, doubts[name])
         elif best is None or name not in best.problem.places:
+            lacking = next((each for each in (name, base) if not alone[each].scenes), None)
             cameras[name] = not_placed(own.calibration, why_not_aligned(
-                name, base, turned.get(name), own.scenes))
+                name, base, turned.get(name), lacking))
         else:
             cameras[name] = placed(
                 name, own.calibration, best, metres is not None, own.start_s - alone[base].start_s,
@@ -164,6 +168,13 @@ def apart_doubts(name: str, solved: Solved) -> tuple[Notice, ...]:
             f'turns show: check that it was not moved during the drive, or drive more turns'),)
 
 
+def unsettled_doubts(name: str, solved: Solved) -> tuple[Notice, ...]:
+    """Return that the problem has no end, or none."""
+    return () if solved.settled else (Notice(
+        'E-RIG-UNSETTLED', f'{name}: no place of the cameras fits best: check that all clips are '
+        f'of one car, and leave out one camera after another'),)
+
+
 def base_doubts(name: str, base: str, doubts: Sequence[Notice]) -> tuple[Notice, ...]:
     """Return why the base keeps a camera's rotation against it from being accepted."""
     return () if not doubts else (Notice(
@@ -184,10 +195,10 @@ def not_placed(calibration: str, reason: Notice) -> PlacedCamera:
     return PlacedCamera(calibration, 'refused', reasons=(reason,))
 
 
-def why_not_aligned(name: str, base: str, found: Aligned | None, scenes: int) -> Notice:
-    """Return why a camera's turning does not fit the base's."""
-    if not scenes:
-        return Notice('E-RIG-NO-SCENES', f'{name}: no stretch of its drive could be '
+def why_not_aligned(name: str, base: str, found: Aligned | None, lacking: str | None) -> Notice:
+    """Return why a camera's turning does not fit the base's. lacking: which one has no scenes."""
+    if lacking:
+        return Notice('E-RIG-NO-SCENES', f'{lacking}: no stretch of its drive could be '
                       f'reconstructed: check its pictures, or drive turns past houses')
     if found is None or found.turned == 0.0:
         return Notice('E-RIG-NO-SHARED', f'{name} and {base} have no turn in common: check that '

@@ -266,7 +266,8 @@ def test_a_file_of_other_cameras_is_left_alone(made, tmp_path):
 
 def test_the_node_solves_turns_in_a_child(start_node, make_bench, tmp_path):
     """What it publishes and offers is what its page says."""
-    node = start_node(command=[*QUICK_COMMAND, 'rig'], cameras='front left', stores=tmp_path)
+    node = start_node(command=[*QUICK_COMMAND, 'rig'], cameras='front left', stores=tmp_path,
+                      intrinsics__profile_tracks=40)
     bench, heard = make_bench(listen=False), {}
     for name, kind in (('/diagnostics', DiagnosticArray), ('rig/result', String)):
         bench.node.create_subscription(
