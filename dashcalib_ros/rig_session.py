@@ -27,9 +27,9 @@ from dashcalib_ros.judge.calibration import Level
 from dashcalib_ros.pipeline import Calibrator
 from dashcalib_ros.report import Calibration
 from dashcalib_ros.rig.dense import Retraced, retraced
-from dashcalib_ros.rig.joint import Solved
+from dashcalib_ros.rig.joint import Matched, Solved
 from dashcalib_ros.rig.paths import CameraPaths, camera_paths, coarse_paths, ordered
-from dashcalib_ros.rig.placed import Alone, RigCalibration, rig_of_paths
+from dashcalib_ros.rig.placed import Alone, RigCalibration, Witnessed, rig_of_paths
 from dashcalib_ros.rig.start import Aligned, Metres, aligned
 from dashcalib_ros.rig.witness import (
     Epipolar,
@@ -38,6 +38,7 @@ from dashcalib_ros.rig.witness import (
     matched,
     rays_of,
     residual_over,
+    rotation_by_matches,
     sees_alike,
 )
 from dashcalib_ros.session import (
@@ -101,12 +102,13 @@ class _Named(Observer):
 
 def rig_of_drives(drives: Mapping[str, Recording], base: str | None = None,
                   config: Config | None = None, observer: Observer | None = None,
-                  place: Callable[[str], str] = lambda name: f'{name}/result.json') -> Rig:
+                  place: Callable[[str], str] = lambda name: f'{name}/result.json',
+                  match: bool = False) -> Rig:
     """Calibrate the cameras of one car, and where each sits.
 
     drives: by the cameras' names. base: the name of the camera that the others are placed
     against; None: the first one whose lens is accepted. place: of a camera's result, for the file.
-    Raises InputError.
+    match: use matches between cameras, too. Raises InputError.
     """
     config, observer = config or Config(), observer or Observer()
     if base not in (None, *drives) or len(drives) < 2:
@@ -131,7 +133,7 @@ def rig_of_drives(drives: Mapping[str, Recording], base: str | None = None,
                          len(found[name].scenes)) for name, each in learned.items()}
     mount = learned[base].calibration.mount
     return Rig(rig_of_paths(alone, base, turned, paths, _metres(learned, again.late), config.rig,
-                            lambda best: _witnessed(learned, best, matches),
+                            lambda best: _witnessed(learned, best, matches, match),
                             None if mount is None else mount.rotation),
                {name: each.calibration for name, each in learned.items()})
 
@@ -271,17 +273,19 @@ class _Again:
 
 
 def _witnessed(learned: Mapping[str, Learned], best: Solved,
-               matches: Mapping[tuple[str, str], Sequence[tuple[Floats, Floats]]]
-               ) -> tuple[dict[tuple[str, str], Epipolar], dict[str, tuple[Notice, ...]]]:
-    """Return the epipolar residuals, and what contradicts a camera's rotation."""
+               matches: Mapping[tuple[str, str], Sequence[tuple[Floats, Floats]]], use: bool
+               ) -> Witnessed:
+    """Return what cameras see together. use: what contradicts no place is an observation."""
     found: dict[tuple[str, str], Epipolar] = {}
     doubts: dict[str, tuple[Notice, ...]] = {}
+    used: list[Matched] = []
     for (a, b), pairs in matches.items():
         if not pairs or not {a, b} <= best.problem.places.keys():
             continue
         solutions = [solution for name in (a, b) if (solution := learned[name].solution)]
         cameras = [solution.camera for solution in solutions]
-        rays, xy = rays_of(cameras, pairs, [solution.field for solution in solutions])
+        fields = [solution.field for solution in solutions]
+        rays, xy = rays_of(cameras, pairs, fields)
         across = best.problem.places[b].rotation @ best.problem.places[a].rotation.T
         scale = learned[a].scale.px
         held = fitted(rays, across, cameras[0].fx)
@@ -296,7 +300,13 @@ def _witnessed(learned: Mapping[str, Learned], best: Solved,
                     'E-RIG-EPIPOLAR', f'{name}: matches between {a} and {b} say that one is '
                     f'turned by {degrees:.2f} degrees more against the other: check that none was '
                     f'moved during the drive, or drive more turns'))
-    return found, doubts
+        elif use:
+            sigmas = [np.sqrt(np.diag(best.problem.cameras[name].lens_covariance))
+                      for name in (a, b)]
+            matched = rotation_by_matches((a, b), [each.widened() for each in cameras], pairs,
+                                          fields, across, sigmas)
+            used += [] if matched is None else [matched]
+    return Witnessed(found, doubts, tuple(used))
 
 
 def _contradicted(free: Fitted, across: Floats, best: Solved, a: str, b: str) -> float:
@@ -329,7 +339,8 @@ def _speed(speed: Samples, offset: float) -> Metres:
 
 def calibrate_rig(drives: Mapping[str, Paths | Recording], base: str | None = None,
                   fps: float | None = None, config: Settings = None,
-                  motion: MotionOrPath = None, progress: Progress | None = None) -> Rig:
+                  motion: MotionOrPath = None, progress: Progress | None = None,
+                  match: bool = False) -> Rig:
     """Calibrate several cameras of one car from one drive, and where each sits.
 
     drives: by the cameras' names: a bag, a video, a folder of images, or several files of one
@@ -342,6 +353,7 @@ def calibrate_rig(drives: Mapping[str, Paths | Recording], base: str | None = No
     path of a CSV, a GPX file or a KITTI oxts folder, or a stream; with a speed translations are in
     metres.
     progress: called with the name of a stage and its fraction done, 0 to 1; at last 'done', 1.0.
+    match: use what two cameras see at the same time, too, not only as a witness.
 
     Returns a Rig: its rig has a PlacedCamera for each name, with a verdict for each degree of
     freedom; its calibrations have what each camera says alone. Raises InputError
@@ -353,7 +365,7 @@ def calibrate_rig(drives: Mapping[str, Paths | Recording], base: str | None = No
     opened = {name: path if isinstance(path, Recording) else open_camera(
         path, fps, motion if name == clock else None) for name, path in drives.items()}
     with Calls(progress) as observer:
-        return rig_of_drives(opened, base, settings, observer)
+        return rig_of_drives(opened, base, settings, observer, match=match)
 
 
 def open_camera(path: Paths, fps: float | None = None, motion: MotionOrPath = None) -> Recording:

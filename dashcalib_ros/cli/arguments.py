@@ -376,6 +376,9 @@ COMMANDS = {
             ('--motion', {'type': Path, 'metavar': 'FILE',
                           'help': 'a speed of the car, on the clock of the base: translations are '
                                   'in metres then; files as for run'}),
+            ('--match', {'action': 'store_true',
+                         'help': 'use what two cameras see at the same time, too; without it that '
+                                 'is a witness only'}),
             *SETTINGS, SEED, out_folder('rig', '; --json prints rig.json'), JSON, QUIET),
         exit_codes='exit codes: 0 every camera is accepted; 3 one is weak or refused; 2 bad input '
                    'or usage'),

@@ -28,7 +28,7 @@ def rig(args: argparse.Namespace) -> int:
     screen = Screen(args.quiet, to_stderr=args.json)
     with output_folder(args.out):
         with Stages(args.quiet) as stages:
-            found = rig_of_drives(drives, args.base, config, stages)
+            found = rig_of_drives(drives, args.base, config, stages, match=args.match)
         write_rig(found, args.out)
     warn((*found.rig.warnings, *(
         reason for camera in found.rig.cameras.values() for reason in camera.reasons)))

@@ -166,11 +166,27 @@ class Rows:
 
 
 @dataclass(frozen=True)
+class Matched:
+    """The rotation from camera a's axes to b's (3, 3) that matches of both show.
+
+    covariance: (3, 3) of small rotations in b's axes. follow: by camera, (3, n) of these by its
+    lens.
+    """
+
+    a: str
+    b: str
+    rotation: Floats
+    covariance: Floats
+    follow: Mapping[str, Floats]
+
+
+@dataclass(frozen=True)
 class Problem:
     """The present state of a rig.
 
     places: of all cameras. units: log of the metres in a unit of each reference scene; unit_known:
     its prior, value and sigma. lenses: (n,) how far each camera's lens is off its own solution.
+    matched: what else shows rotations.
     """
 
     cameras: Mapping[str, CameraPaths]
@@ -181,6 +197,7 @@ class Problem:
     lenses: Mapping[str, Floats]
     pairs: tuple[Pair, ...]
     noise: Noise = Noise()
+    matched: tuple[Matched, ...] = ()
 
     def scene(self, key: SceneKey) -> ScenePath:
         """Return a scene by its camera and number."""
@@ -328,7 +345,28 @@ class Problem:
                 inverse = np.diag([0, 0, 0, *[REACH_M**-2] * 3, 0, PACE**-2])
                 information[place, place] = inverse
                 score[place] = -inverse @ [0, 0, 0, *own.translation_m, 0, own.pace]
+        for each in self.matched:
+            off, jacobian = self.off_matches(each, count)
+            # lenses are put back in the end: what follows them is no better known than they are
+            covariance = each.covariance + sum(
+                follow @ self.cameras[name].lens_covariance @ follow.T
+                for name, follow in each.follow.items())
+            weighted = np.linalg.solve(covariance, jacobian).T
+            information += weighted @ jacobian
+            score += weighted @ off
         return information, score
+
+    def off_matches(self, found: Matched, count: int) -> tuple[Floats, Floats]:
+        """Return (3,) measured less predicted, and (3, m) derivatives of what is predicted."""
+        across = self.places[found.b].rotation @ self.places[found.a].rotation.T
+        off, jacobian = logarithms((found.rotation @ across.T)[None])[0], np.zeros((3, count))
+        for name, turn in ((found.a, -across), (found.b, np.eye(3))):
+            if name != self.base:
+                jacobian[:, self.where[name]][:, :3] = turn
+            # what was measured follows the lens
+            jacobian[:, self.where['lens', name]] = -found.follow[name]
+            off = off + found.follow[name] @ self.lenses[name]
+        return off, jacobian
 
     def moved(self, step: Floats) -> Problem:
         """Return the problem a step (m,) away."""

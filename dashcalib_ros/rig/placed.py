@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -16,7 +16,7 @@ from dashcalib_ros.config import RigConfig
 from dashcalib_ros.errors import Notice
 from dashcalib_ros.judge.calibration import Level
 from dashcalib_ros.judge.difference import limit_of
-from dashcalib_ros.rig.joint import REACH_M, Solved, solved
+from dashcalib_ros.rig.joint import REACH_M, Matched, Solved, solved
 from dashcalib_ros.rig.paths import CameraPaths
 from dashcalib_ros.rig.start import LEAST_EXPLAINED, Aligned, Metres, problem_of
 from dashcalib_ros.rig.witness import Epipolar
@@ -111,31 +111,41 @@ class Alone:
     scenes: int
 
 
-# from a solved rig: what its cameras see together, and what of that contradicts a camera's place
-Witnessed = Callable[[Solved], tuple[Mapping[tuple[str, str], Epipolar],
-                                     Mapping[str, tuple[Notice, ...]]]]
+@dataclass(frozen=True)
+class Witnessed:
+    """What cameras see together. doubts: what of that contradicts a camera's place.
+
+    matched: rotations that are to be used as observations.
+    """
+
+    epipolar: Mapping[tuple[str, str], Epipolar] = field(default_factory=dict)
+    doubts: Mapping[str, tuple[Notice, ...]] = field(default_factory=dict)
+    matched: tuple[Matched, ...] = ()
 
 
 def rig_of_paths(alone: Mapping[str, Alone], base: str, turned: Mapping[str, Aligned | None],
                  paths: Mapping[str, CameraPaths], metres: Metres | None, limits: RigConfig,
-                 witnessed: Witnessed = lambda best: ({}, {}), car: Floats | None = None
-                 ) -> RigCalibration:
+                 witnessed: Callable[[Solved], Witnessed] = lambda best: Witnessed(),
+                 car: Floats | None = None) -> RigCalibration:
     """Return where the cameras of one car sit.
 
     turned: of each but the base, how its turning fits to the base's. metres: None: unknown. car:
     (3, 3) from the base's optical axes to the car's; None: unknown.
     """
-    seen = {name for name, each in paths.items() if each.scenes}
+    there = {name for name, each in paths.items() if each.scenes}
     kept = {name: each for name, each in turned.items()
-            if each is not None and each.found and {base, name} <= seen}
+            if each is not None and each.found and {base, name} <= there}
     problem = problem_of(paths, base, kept, metres) if kept else None
     best = solved(problem) if problem and problem.pairs else None
     doubts = {name: lens_doubts(name, each.level) for name, each in alone.items()}
-    witness: Mapping[tuple[str, str], Epipolar] = {}
-    if best is not None:
-        witness, contradicted = witnessed(best)
+    seen = Witnessed()
+    if problem is not None and best is not None:
+        seen = witnessed(best)
+        if seen.matched:
+            best = solved(replace(problem, matched=seen.matched))
+            seen = replace(seen, epipolar=witnessed(best).epipolar)
         doubts = {name: (*each, *(apart_doubts(name, best) if name in best.problem.lenses else ()),
-                         *unsettled_doubts(name, best), *contradicted.get(name, ()))
+                         *unsettled_doubts(name, best), *seen.doubts.get(name, ()))
                   for name, each in doubts.items()}
     cameras: dict[str, PlacedCamera] = {}
     for name, own in alone.items():
@@ -149,7 +159,7 @@ def rig_of_paths(alone: Mapping[str, Alone], base: str, turned: Mapping[str, Ali
             cameras[name] = placed(
                 name, own.calibration, best, metres is not None, own.start_s - alone[base].start_s,
                 limits, (*doubts[name], *base_doubts(name, base, doubts[base])))
-    return RigCalibration(base, cameras, witness,
+    return RigCalibration(base, cameras, seen.epipolar,
                           () if car is None else misnamed(cameras, car))
 
 

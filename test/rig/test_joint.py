@@ -11,7 +11,7 @@ from made_rig import SPEED, Mounted, made_paths
 from dashcalib_ros.camera.rotation import OPTICAL, rotation_matrices, rotation_vectors
 from dashcalib_ros.config import RigConfig
 from dashcalib_ros.rig import joint
-from dashcalib_ros.rig.joint import Solved, solved
+from dashcalib_ros.rig.joint import Matched, Solved, solved
 from dashcalib_ros.rig.moved import changes
 from dashcalib_ros.rig.paths import CameraPaths
 from dashcalib_ros.rig.placed import (
@@ -265,3 +265,31 @@ def test_a_rig_that_does_not_settle_is_not_accepted(monkeypatch):
     monkeypatch.setattr(joint, 'SETTLED', 1e-12)
     found = of_paths(paths)
     assert not found.accepted and codes_of(found.cameras['rear'])[0] == 'E-RIG-UNSETTLED'
+
+
+def test_matches_are_observations_of_cameras_and_lenses():
+    cameras = {name: CAMERAS[name] for name in ('front', 'left')}
+    paths, _ = made_paths(cameras, yaws=(85.0, -75.0), lens_sigma=0.3)
+    found = {'left': aligned(paths['left'], paths['front'])}
+    problem = problem_of(paths, 'front', found, speed)
+    true, plain = CAMERAS['left'].rotation, solved(problem)
+    noise, nothing = np.radians(0.02), np.zeros((3, 3))
+    sharp = Matched('front', 'left', true, noise**2 * np.eye(3),
+                    {'front': nothing, 'left': nothing})
+    best = solved(replace(problem, matched=(sharp,)))
+    assert np.degrees(best.sigma('left')[:3]).max() < 0.03 < np.degrees(
+        plain.sigma('left')[:3]).max()
+    assert np.abs(np.degrees(errors(best, 'left')[:3])).max() < 0.06
+    # what depends on a lens that is not known says little
+    dull = replace(sharp, follow={'front': nothing, 'left': np.eye(3)})
+    np.testing.assert_allclose(solved(replace(problem, matched=(dull,))).sigma('left')[:3],
+                               plain.sigma('left')[:3], rtol=0.2)
+    # between two cameras of which none is the base
+    paths, _ = made_paths(CAMERAS, yaws=(85.0, -75.0), lens_sigma=0.3)
+    turned = {name: aligned(paths[name], paths['front']) for name in ('left', 'rear')}
+    across = CAMERAS['rear'].rotation @ true.T
+    problem = replace(problem_of(paths, 'front', turned, speed), matched=(replace(
+        sharp, a='left', b='rear', rotation=across, follow={'left': nothing, 'rear': nothing}),))
+    places = solved(problem).problem.places
+    off = rotation_vectors((places['rear'].rotation @ places['left'].rotation.T @ across.T)[None])
+    assert np.abs(np.degrees(off)).max() < 0.06
