@@ -23,13 +23,18 @@ from dashcalib_ros.input import Frame
 from dashcalib_ros.input.inputs import Paths
 from dashcalib_ros.input.motion import Samples, speeds_of
 from dashcalib_ros.input.scale import Scale
-from dashcalib_ros.judge.calibration import Level
 from dashcalib_ros.pipeline import Calibrator
 from dashcalib_ros.report import Calibration
 from dashcalib_ros.rig.dense import Retraced, retraced
 from dashcalib_ros.rig.joint import Matched, Solved
 from dashcalib_ros.rig.paths import CameraPaths, camera_paths, coarse_paths, ordered
-from dashcalib_ros.rig.placed import Alone, RigCalibration, Witnessed, rig_of_paths
+from dashcalib_ros.rig.placed import (
+    Alone,
+    RigCalibration,
+    Witnessed,
+    best_base,
+    rig_of_paths,
+)
 from dashcalib_ros.rig.start import Aligned, Metres, aligned
 from dashcalib_ros.rig.witness import (
     Epipolar,
@@ -117,8 +122,8 @@ def rig_of_drives(drives: Mapping[str, Recording], base: str | None = None,
     learned = {name: _learn(name, drive, config, observer) for name, drive in drives.items()}
     found = {name: coarse_paths(name, each.solution, each.start_s)
              for name, each in learned.items()}
-    base = base or _first({name: each.calibration.verdict.level
-                           for name, each in learned.items()})
+    base = base or best_base({name: each.calibration.verdict.level
+                              for name, each in learned.items()})
     turned = {name: aligned(found[name], found[base], _clock(learned, name, base))
               for name in drives if name != base}
     kept = {name: each for name, each in turned.items() if each is not None and each.found}
@@ -151,11 +156,6 @@ def _learn(name: str, drive: Recording, config: Config, observer: Observer) -> L
 def _kept(drive: Recording, calibration: Calibration, calibrator: Calibrator) -> Learned:
     return Learned(drive, calibration, calibrator.solution, calibrator.detection.scale,
                    calibrator.detection.valid())
-
-
-def _first(levels: Mapping[str, Level]) -> str:
-    """Return the first camera of the best lenses: one that is refused keeps no other one."""
-    return min(levels, key=lambda name: ('accepted', 'weak', 'refused').index(levels[name]))
 
 
 def _clock(learned: Mapping[str, Learned], name: str, base: str) -> float:

@@ -62,12 +62,6 @@ def test_pictures_show_where_a_camera_sits(placed):
     assert [each.mount.rear for each in found.calibrations.values()] == [False, True]
 
 
-def test_the_base_is_the_first_camera_whose_lens_is_accepted():
-    assert rig_session._first({'front': 'refused', 'left': 'weak', 'rear': 'accepted'}) == 'rear'
-    assert rig_session._first({'front': 'accepted', 'left': 'accepted'}) == 'front'
-    assert rig_session._first({'front': 'refused', 'left': 'weak', 'rear': 'weak'}) == 'left'
-
-
 def test_a_lens_and_its_verdict_stay_together(placed):
     found, _, kept = placed
     for name, (_, solution, *_) in kept.items():

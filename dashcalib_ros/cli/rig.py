@@ -9,8 +9,7 @@ from dashcalib_ros.cli.arguments import ACCEPTED, NOT_ENOUGH, UsageError
 from dashcalib_ros.cli.drive import read_config
 from dashcalib_ros.cli.run import now
 from dashcalib_ros.cli.terminal import Screen, Stages, warn
-from dashcalib_ros.errors import ConfigError, Notice
-from dashcalib_ros.formats.rig import RIG, RIG_FORMATS, placed_cameras, rig_json
+from dashcalib_ros.formats.rig import RIG, RIG_FORMATS, placed_cameras, rig_files, rig_json
 from dashcalib_ros.report import output_folder, write_results, write_text
 from dashcalib_ros.report.files import REPORT
 from dashcalib_ros.report.rig import rig_html, rig_lines, witness_lines
@@ -60,11 +59,9 @@ def write_rig(found: Rig, out: Path) -> None:
     for name, calibration in found.calibrations.items():
         write_results(calibration, out / name, created=now())
     cameras = placed_cameras(found.rig, found.calibrations)
-    for name, write in RIG_FORMATS.items():
-        try:
-            write_text(out / name, write(cameras))
-        except ConfigError as error:
-            (out / name).unlink(missing_ok=True)
-            warn([Notice(error.code, f'{name} is not written: {error}')])
-    write_text(out / REPORT, rig_html(found.rig, cameras))
-    write_text(out / RIG, rig_json(found.rig))
+    files, missing = rig_files(found.rig, cameras)
+    warn(missing)
+    for name in RIG_FORMATS.keys() - files.keys():
+        (out / name).unlink(missing_ok=True)
+    for name, text in {REPORT: rig_html(found.rig, cameras), **files}.items():
+        write_text(out / name, text)

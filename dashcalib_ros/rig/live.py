@@ -20,10 +20,14 @@ from dashcalib_ros.rig.start import aligned
 from dashcalib_ros.solve import solve
 from dashcalib_ros.solve.solution import Solution
 
+# s; clocks of one car that are dates differ by less
+CLOCKS_S = 60.0
+
 
 def rig_of_scenes(scenes: Mapping[str, Sequence[Scene]], levels: Mapping[str, Level], base: str,
-                  since_s: float, speed: Samples | None, config: Config) -> RigCalibration:
-    """Return where cameras sit whose stamps are of about one clock.
+                  since_s: float, speed: Samples | None, config: Config,
+                  clocks_s: float = CLOCKS_S) -> RigCalibration:
+    """Return where cameras sit whose stamps are of about one clock, to clocks_s.
 
     scenes: by the cameras' names, each once. levels: of their lenses. since_s: stamp from which on
     scenes say where the cameras sit; earlier ones say what the lenses are. speed: of the car, m/s.
@@ -38,7 +42,8 @@ def rig_of_scenes(scenes: Mapping[str, Sequence[Scene]], levels: Mapping[str, Le
             scene for scene in paths.scenes if scene.seconds[0] + start_s >= since_s))
 
     found = {name: newer(coarse_paths(name, each, start_s)) for name, each in solutions.items()}
-    turned = {name: aligned(found[name], found[base], 0.0) for name in scenes if name != base}
+    turned = {name: aligned(found[name], found[base], 0.0, clocks_s)
+              for name in scenes if name != base}
     paths = {name: newer(_paths(name, each, scenes[name], start_s, config))
              for name, each in solutions.items() if each is not None}
     alone = {name: Alone(name, levels[name], start_s, len(each.scenes))

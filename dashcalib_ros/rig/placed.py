@@ -123,6 +123,11 @@ class Witnessed:
     matched: tuple[Matched, ...] = ()
 
 
+def best_base(levels: Mapping[str, Level]) -> str:
+    """Return the first camera of those with the best lenses: a refused one keeps no other one."""
+    return min(levels, key=lambda name: ('accepted', 'weak', 'refused').index(levels[name]))
+
+
 def rig_of_paths(alone: Mapping[str, Alone], base: str, turned: Mapping[str, Aligned | None],
                  paths: Mapping[str, CameraPaths], metres: Metres | None, limits: RigConfig,
                  witnessed: Callable[[Solved], Witnessed] = lambda best: Witnessed(),

@@ -20,6 +20,7 @@ from dashcalib_ros.rig.placed import (
     apart_doubts,
     base_camera,
     base_doubts,
+    best_base,
     lens_doubts,
     misnamed,
     placed,
@@ -293,3 +294,9 @@ def test_matches_are_observations_of_cameras_and_lenses():
     places = solved(problem).problem.places
     off = rotation_vectors((places['rear'].rotation @ places['left'].rotation.T @ across.T)[None])
     assert np.abs(np.degrees(off)).max() < 0.06
+
+
+def test_the_base_is_the_first_camera_whose_lens_is_accepted():
+    assert best_base({'front': 'refused', 'left': 'weak', 'rear': 'accepted'}) == 'rear'
+    assert best_base({'front': 'accepted', 'left': 'accepted'}) == 'front'
+    assert best_base({'front': 'refused', 'left': 'weak', 'rear': 'weak'}) == 'left'
