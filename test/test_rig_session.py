@@ -2,6 +2,7 @@
 """Pictures of two cameras of one car, ahead and back, with exact truth: from drives to a rig."""
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,9 @@ from shared_drive import LENS, QUICK, SPEC
 from solving import remembered
 
 from dashcalib_ros import rig_session
-from dashcalib_ros.camera.rotation import rotation_vectors
+from dashcalib_ros.camera.rotation import rotation_matrices, rotation_vectors
+from dashcalib_ros.cli import demo
+from dashcalib_ros.cli.program import main
 from dashcalib_ros.cli.rig import write_rig
 from dashcalib_ros.demo import Drive, Mounting, render_to_bag, true_places
 from dashcalib_ros.errors import Notice
@@ -125,3 +128,25 @@ def test_a_rig_is_written_for_all_who_take_it(placed, tmp_path):
                for name, each in found.calibrations.items()}
     write_rig(replace(found, calibrations=refused), tmp_path)
     assert not (tmp_path / 'camchain.yaml').exists() and (tmp_path / 'rig.urdf').exists()
+
+
+@pytest.mark.thorough
+def test_the_demo_renders_a_rig_and_tells_the_truth(shared_drive, tmp_path, monkeypatch, capfd):
+    drives = {'front': shared_drive, 'rear': Drive(LENS, BACK)}
+    monkeypatch.setattr(demo, 'rig_drives', lambda seed: drives)
+    monkeypatch.setattr(demo, 'read_config', lambda args: QUICK)
+    folder = tmp_path / 'demo'
+    code = main(['demo', '--rig', '--json', '--keep-bag', '--out', str(folder)])
+    truth = json.loads((folder / 'truth.json').read_text())
+    found = load_rig(folder)
+    assert code == 0 and found.accepted and json.loads(capfd.readouterr().out)['base'] == 'front'
+    assert {'bag-front', 'bag-rear', 'front', 'rear', *RIG_FORMATS} < {
+        each.name for each in folder.iterdir()}
+    true, rear = truth['cameras']['rear'], found.cameras['rear']
+    turn = rotation_matrices(np.radians([true['rotation_deg']]))[0]
+    off = np.degrees(rotation_vectors((rear.rotation @ turn.T)[None])[0])
+    assert truth['base'] == 'front' and np.all(np.abs(off) < 3.5 * np.array(
+        rear.rotation_sigma_deg))
+    assert abs(rear.time_offset_s - true['time_offset_s']) < 3.5 * rear.time_sigma_s
+    # no speed, no metres
+    assert rear.translation_m is None

@@ -13,13 +13,20 @@ from std_msgs.msg import Header, String
 
 from dashcalib_ros.camera.rotation import quaternion
 from dashcalib_ros.detect.turn import is_turn
-from dashcalib_ros.errors import ConfigError, DashcalibError, InputError, coded, one_line
+from dashcalib_ros.errors import (
+    ConfigError,
+    DashcalibError,
+    InputError,
+    OutputError,
+    coded,
+    one_line,
+)
 from dashcalib_ros.formats.rig import RIG, load_rig, rig_json
 from dashcalib_ros.formats.ros import check_camera_name
 from dashcalib_ros.input.motion import SensorBuffer, speeds_of
 from dashcalib_ros.judge.calibration import Level
 from dashcalib_ros.limits import read_file
-from dashcalib_ros.report import write_text
+from dashcalib_ros.report import set_aside, write_text
 from dashcalib_ros.report.rig import change_lines, rig_lines
 from dashcalib_ros.rig.live import rig_of_scenes
 from dashcalib_ros.rig.moved import changes
@@ -159,6 +166,10 @@ class Placing:
         self._log.warning('reset by request: where the cameras sat is forgotten')
         self.rig, self._last, self._moved, self._tried = None, None, '', None
         self._since_s, self._call = self._newest_s(), None
+        try:
+            set_aside(self._file)
+        except OutputError as error:
+            return False, coded(error)
         return True, 'collecting; what is published stays until a rig is accepted'
 
     # a rig -------------------------------------------------------------------------------------
@@ -202,17 +213,19 @@ class Placing:
             self._log.info(rig_lines({name: camera})[0])
             for reason in camera.reasons:
                 self._endpoints.complaints.once(coded(reason))
-        before = self.rig
-        change = None if before is None else changes(found, before)
+        change = None if self.rig is None else changes(found, self.rig)
+        suspects: set[str] = set()
         if change is not None and change.answer == 'wrong':
-            before, first = None, not self._moved
-            self._moved = '; '.join(change_lines(replace(change, unknown=(), cameras={
-                name: move for name, move in change.cameras.items()
-                if move.moved or move.perhaps}))[1:])
+            moves = {name: move for name, move in change.cameras.items()
+                     if move.moved or move.perhaps}
+            suspects = {*moves, *change.exchanged}
+            first, self._moved = not self._moved, '; '.join(
+                change_lines(replace(change, unknown=(), cameras=moves))[1:])
             if first:
                 self._log.warning(f'{self._moved}; after ~/reset this is not an error any more')
-        # what was accepted before stays as it is
-        known = {} if before is None else _accepted(before)
+        # what was accepted before, and was not moved, stays as it is
+        known = {} if self.rig is None or self._base in suspects else {
+            name: camera for name, camera in _accepted(self.rig).items() if name not in suspects}
         accepted = _accepted(found) | known
         if self._base in accepted and len(accepted) > max(len(known), 1):
             self._use(replace(found, cameras={**found.cameras, **known}))

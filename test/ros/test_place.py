@@ -164,7 +164,21 @@ def test_a_camera_that_was_moved_is_named(made, tmp_path, again):
     now = desk.published[-1]['cameras']['left']
     assert now['rotation_deg'] == pytest.approx(
         seen_rig('left', 'rear', turned='left', seed=1).cameras['left'].rotation_deg)
+    # the others stay where they were found first
+    assert desk.published[-1]['cameras']['rear'] == desk.published[0]['cameras']['rear'] or again
+    assert (tmp_path / 'rig.json').exists()
     assert desk.placing._reset()[0] and desk.step() == (WARN, 'collecting')
+    assert not (tmp_path / 'rig.json').exists()
+
+
+def test_of_two_cameras_either_may_have_moved(made, tmp_path):
+    desk = made(seen_rig('left'), seen_rig('left', turned='left', seed=1), names=NAMES[:2])
+    for after in (0, 100):
+        for name in NAMES[:2]:
+            store(tmp_path, name, after, after + 40)
+        found = desk.step()
+    assert found == (ERROR, 'moved') and len(desk.published) == 2
+    assert {name for name in NAMES if name in desk.placing._moved} == {'front', 'left'}
 
 
 def test_what_is_not_moved_stays_as_it_is(made, tmp_path):
