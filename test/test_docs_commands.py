@@ -221,7 +221,7 @@ def starts_and_stops(tmp_path):
             if 'autostart:=false' in arguments:
                 wait_for(lambda: node.catches(signal.SIGTERM))
             else:
-                node.wait_for('the turns seen on')
+                node.wait_for('by turns in' if arguments[0] == 'rig' else 'the turns seen on')
             assert node.stop() == 0, node.text
         finally:
             node.kill()
