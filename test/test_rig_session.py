@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from made_rig import Mounted, made_paths
 from shared_drive import LENS, QUICK, SPEC
 from solving import remembered
 
 from dashcalib_ros import rig_session
+from dashcalib_ros.camera import Radial
 from dashcalib_ros.camera.rotation import rotation_matrices, rotation_vectors
 from dashcalib_ros.cli import demo
 from dashcalib_ros.cli.program import main
@@ -22,7 +25,9 @@ from dashcalib_ros.formats.rig import RIG_FORMATS, load_rig
 from dashcalib_ros.input.motion import Samples, SensorStream
 from dashcalib_ros.judge import Verdict
 from dashcalib_ros.rig import live
+from dashcalib_ros.rig.joint import solved
 from dashcalib_ros.rig.live import rig_of_scenes
+from dashcalib_ros.rig.start import aligned, problem_of
 
 BACK = replace(SPEC, rolling_shutter_ms=12.0, mounting=Mounting(
     178.0, -3.0, 1.0, -0.9, -0.1, 1.2, phase_s=0.05, late_s=0.3))
@@ -110,6 +115,39 @@ def test_turns_without_their_images_show_it_too(placed, monkeypatch):
     rig = rig_of_scenes({**scenes, 'rear': ()}, dict.fromkeys(scenes, 'weak'), 'front', 0.0, None,
                         QUICK)
     assert rig.cameras['rear'].verdict == 'refused' and rig.cameras['front'].verdict == 'weak'
+
+
+@pytest.mark.parametrize('off_deg', [0.0, 2.0])
+def test_matches_are_used_unless_they_contradict_a_place(monkeypatch, off_deg):
+    """off_deg: by which the second camera is turned more in the matches."""
+    turn = rotation_matrices(np.radians([[0.5, -2.0, 1.0]]))[0]
+    paths, _ = made_paths({'front': Mounted(), 'right': Mounted((0.5, -2.0, 1.0),
+                                                                (-0.5, 0.02, 0.03))},
+                          lens_sigma=0.01)
+    best = solved(problem_of(paths, 'front', {'right': aligned(paths['right'], paths['front'])},
+                             None))
+    camera = Radial((800, 450), 520.0, 520.0, 400.0, 225.0, -0.2, 0.05)
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(6, 40, 900)
+    points = depth[:, None] * np.column_stack([
+        rng.uniform(-0.6, 0.6, 900), rng.uniform(-0.35, 0.35, 900), np.ones(900)])
+    more = rotation_matrices(np.radians([[off_deg, 0.0, 0.0]]))[0]
+    pairs = tuple(camera.project(each) + 0.2 * rng.normal(size=(900, 2)) for each in (
+        points, (points @ turn.T + [-0.5, 0.02, 0.03]) @ more.T))
+    inside = np.isfinite(pairs[0] + pairs[1]).all(axis=1)
+    one = SimpleNamespace(solution=SimpleNamespace(camera=camera, field=None),
+                          scale=SimpleNamespace(px=2.0))
+    monkeypatch.setattr(rig_session, 'rotation_by_matches', lambda pair, *given: pair)
+    for use in (False, True):
+        found = rig_session._witnessed(dict.fromkeys(paths, one), best, {('front', 'right'): [
+            tuple(side[inside] for side in pairs)]}, use)
+        if off_deg:
+            assert [each.code for each in found.doubts['right']] == ['E-RIG-EPIPOLAR']
+            assert not found.matched
+        else:
+            assert not found.doubts and found.matched == (('front', 'right'),) * use
+            # in px of the input
+            assert found.epipolar['front', 'right'].median < 0.6
 
 
 def test_a_rig_is_written_for_all_who_take_it(placed, tmp_path):
