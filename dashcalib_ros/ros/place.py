@@ -195,8 +195,9 @@ class Placing:
         turns = self.inputs.turns
         now = ({name: tuple(turn.stamp_s for turn in each) for name, each in turns.items()},
                dict(self._levels))
-        if (now == self._tried or max(self._shared().values()) < LEAST_STRETCHES
-                or time.monotonic() - self.inputs.changed < SETTLED_S):
+        if now == self._tried or time.monotonic() - self.inputs.changed < SETTLED_S or not any(
+                count >= LEAST_STRETCHES and not {name, self._base} & set(self._unknown)
+                for name, count in self._shared().items()):
             return
         self._tried = now
         stream = self._sensors.stream()
@@ -306,8 +307,7 @@ class Placing:
                 'turns': '; '.join(f'{name} {len(each)}' for name, each
                                    in self.inputs.turns.items()),
                 'shared turns': self._shared_text, 'reasons': '; '.join(self._reasons),
-                'accepted lenses': ' '.join(name for name, level in self._levels.items()
-                                            if level == 'accepted'),
+                'lenses not accepted': ' '.join(self._unknown),
                 'file': self._file, **self._endpoints.complaints.counts}))
 
     def _state(self) -> tuple[bytes, str, str]:
@@ -321,7 +321,14 @@ class Placing:
             return OK, 'placed', f'placed: {" ".join(self._names)}'
         return WARN, 'collecting' if self._call is None else 'placing', '; '.join((
             f'not placed yet: {" ".join(missing)}; turns that {self._base} saw, too: '
-            f'{self._shared_text}, {LEAST_STRETCHES} are needed', *self._reasons[:1]))
+            f'{self._shared_text}, {LEAST_STRETCHES} are needed',
+            *([f'lenses not accepted: {" ".join(self._unknown)}'] if self._unknown else ()),
+            *self._reasons[:1]))
+
+    @property
+    def _unknown(self) -> list[str]:
+        """Return the cameras whose calibrators have accepted no lens."""
+        return [name for name, level in self._levels.items() if level != 'accepted']
 
     @property
     def _shared_text(self) -> str:
