@@ -86,6 +86,7 @@ setup(
             'dashcalib = dashcalib_ros.cli:command',
             'dashcalib-calibrator = dashcalib_ros.ros:calibrator',
             'dashcalib-checker = dashcalib_ros.ros:checker',
+            'dashcalib-rig = dashcalib_ros.ros:rig',
         ],
     },
 )

@@ -21,26 +21,21 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.errors import InputError, Notice
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.inputs import Paths
-from dashcalib_ros.input.motion import speeds_of
+from dashcalib_ros.input.motion import Samples, speeds_of
 from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.pipeline import Calibrator
 from dashcalib_ros.report import Calibration
 from dashcalib_ros.rig.dense import Retraced, retraced
-from dashcalib_ros.rig.joint import Solved, solved
+from dashcalib_ros.rig.joint import Matched, Solved
 from dashcalib_ros.rig.paths import CameraPaths, camera_paths, coarse_paths, ordered
 from dashcalib_ros.rig.placed import (
-    PlacedCamera,
+    Alone,
     RigCalibration,
-    apart_doubts,
-    base_camera,
-    base_doubts,
-    lens_doubts,
-    misnamed,
-    not_placed,
-    placed,
-    why_not_aligned,
+    Witnessed,
+    best_base,
+    rig_of_paths,
 )
-from dashcalib_ros.rig.start import Aligned, Metres, aligned, problem_of
+from dashcalib_ros.rig.start import Aligned, Metres, aligned
 from dashcalib_ros.rig.witness import (
     Epipolar,
     Fitted,
@@ -48,6 +43,7 @@ from dashcalib_ros.rig.witness import (
     matched,
     rays_of,
     residual_over,
+    rotation_by_matches,
     sees_alike,
 )
 from dashcalib_ros.session import (
@@ -111,20 +107,23 @@ class _Named(Observer):
 
 def rig_of_drives(drives: Mapping[str, Recording], base: str | None = None,
                   config: Config | None = None, observer: Observer | None = None,
-                  place: Callable[[str], str] = lambda name: f'{name}/result.json') -> Rig:
+                  place: Callable[[str], str] = lambda name: f'{name}/result.json',
+                  match: bool = False) -> Rig:
     """Calibrate the cameras of one car, and where each sits.
 
     drives: by the cameras' names. base: the name of the camera that the others are placed
-    against; None: the first. place: of a camera's result, for the file. Raises InputError.
+    against; None: the first one whose lens is accepted. place: of a camera's result, for the file.
+    match: use matches between cameras, too. Raises InputError.
     """
     config, observer = config or Config(), observer or Observer()
-    base = base or next(iter(drives))
-    if base not in drives or len(drives) < 2:
+    if base not in (None, *drives) or len(drives) < 2:
         raise InputError('E-RIG-CAMERAS', f'a rig needs two cameras, and its base, {base}, is one '
                          f'of them: name them as front=front.mp4 left=left.mp4')
     learned = {name: _learn(name, drive, config, observer) for name, drive in drives.items()}
     found = {name: coarse_paths(name, each.solution, each.start_s)
              for name, each in learned.items()}
+    base = base or best_base({name: each.calibration.verdict.level
+                              for name, each in learned.items()})
     turned = {name: aligned(found[name], found[base], _clock(learned, name, base))
               for name in drives if name != base}
     kept = {name: each for name, each in turned.items() if each is not None and each.found}
@@ -135,32 +134,12 @@ def rig_of_drives(drives: Mapping[str, Recording], base: str | None = None,
         paths = again.paths(pool, observer)
         matches = again.matches(pool)
     observer.show('placing the cameras', None)
-    metres = _metres(learned[base])
-    problem = problem_of(paths, base, kept, metres)
-    best = solved(problem) if problem.pairs else None
-    doubts = {name: lens_doubts(name, each.calibration.verdict.level)
-              for name, each in learned.items()}
-    cameras: dict[str, PlacedCamera] = {}
-    witness: Mapping[tuple[str, str], Epipolar] = {}
-    if best is not None:
-        for name in best.problem.lenses:
-            doubts[name] += apart_doubts(name, best)
-        witness, contradicted = _witnessed(learned, best, matches)
-        doubts = {name: (*each, *contradicted.get(name, ())) for name, each in doubts.items()}
-    for name in drives:
-        if name == base:
-            cameras[name] = base_camera(place(name), doubts[name])
-        elif best is None or name not in best.problem.places:
-            cameras[name] = not_placed(place(name), why_not_aligned(
-                name, base, turned[name], len(found[name].scenes)))
-        else:
-            cameras[name] = placed(
-                name, place(name), best, metres is not None,
-                learned[name].start_s - learned[base].start_s, config.rig,
-                (*doubts[name], *base_doubts(name, base, doubts[base])))
+    alone = {name: Alone(place(name), each.calibration.verdict.level, each.start_s,
+                         len(found[name].scenes)) for name, each in learned.items()}
     mount = learned[base].calibration.mount
-    warnings = () if mount is None else misnamed(cameras, mount.rotation)
-    return Rig(RigCalibration(base, cameras, witness, warnings),
+    return Rig(rig_of_paths(alone, base, turned, paths, _metres(learned, again.late), config.rig,
+                            lambda best: _witnessed(learned, best, matches, match),
+                            None if mount is None else mount.rotation),
                {name: each.calibration for name, each in learned.items()})
 
 
@@ -186,7 +165,7 @@ def _clock(learned: Mapping[str, Learned], name: str, base: str) -> float:
 
 @contextmanager
 def _workers(config: Config, observer: Observer) -> Iterator[ScenePool]:
-    pool = ScenePool(config, lambda: ChildWorker(False, False, config.threads, lambda text: None),
+    pool = ScenePool(config, lambda: ChildWorker(False, False, config.workers, lambda text: None),
                      _load)
     pool.start()
     try:
@@ -201,17 +180,20 @@ def _load() -> None:
 
 
 class _Again:
-    """The second reading of the drives: the images of stretches that are shared."""
+    """The second reading of the drives: the images of stretches that are shared.
+
+    late: of the clocks of the cameras that are aligned, against the base's, s.
+    """
 
     def __init__(self, learned: Mapping[str, Learned], base: str,
                  found: Mapping[str, CameraPaths], kept: Mapping[str, Aligned],
                  config: Config) -> None:
         self._learned, self._base, self._config = learned, base, config
-        self._late = {base: 0.0} | {name: each.late_s for name, each in kept.items()}
+        self.late = {base: 0.0} | {name: each.late_s for name, each in kept.items()}
         self._rotations = {base: np.eye(3)} | {
             name: each.rotation for name, each in kept.items()}
         spans = {name: [(scene.seconds[0] - late, scene.seconds[-1] - late)
-                        for scene in found[name].scenes] for name, late in self._late.items()}
+                        for scene in found[name].scenes] for name, late in self.late.items()}
         others = {name: [span for other in spans if other != name
                          and self._base in (name, other) for span in spans[other]]
                   for name in spans}
@@ -224,7 +206,7 @@ class _Again:
 
     def read(self) -> None:
         """Read the drives."""
-        for name, late in self._late.items():
+        for name, late in self.late.items():
             each = self._learned[name]
             wanted = {n: self._spans[name][n] for n in self._shared[name]}
             last = max((end for _, end in wanted.values()), default=-np.inf)
@@ -245,7 +227,7 @@ class _Again:
 
     def _seconds(self, name: str, frame: Frame) -> float:
         each = self._learned[name]
-        return float(frame.stamp_ns / 1e9 - each.start_s - self._late[name])
+        return float(frame.stamp_ns / 1e9 - each.start_s - self.late[name])
 
     def paths(self, pool: ScenePool, observer: Observer) -> dict[str, CameraPaths]:
         """Return the paths of the cameras, with the pose of every image."""
@@ -256,7 +238,7 @@ class _Again:
             scene = ordered(each.solution)[n]
             calls[name, n] = pool.begin(
                 retraced, list(frames.values()), scene, each.solution, self._config, each.valid)
-        stretches: dict[str, list[Retraced]] = {name: [] for name in self._late}
+        stretches: dict[str, list[Retraced]] = {name: [] for name in self.late}
         for number, ((name, _), call) in enumerate(calls.items()):
             observer.show('retracing the stretches that cameras share', number / len(calls))
             stretch = pool.result(call)
@@ -291,17 +273,19 @@ class _Again:
 
 
 def _witnessed(learned: Mapping[str, Learned], best: Solved,
-               matches: Mapping[tuple[str, str], Sequence[tuple[Floats, Floats]]]
-               ) -> tuple[dict[tuple[str, str], Epipolar], dict[str, tuple[Notice, ...]]]:
-    """Return the epipolar residuals, and what contradicts a camera's rotation."""
+               matches: Mapping[tuple[str, str], Sequence[tuple[Floats, Floats]]], use: bool
+               ) -> Witnessed:
+    """Return what cameras see together. use: what contradicts no place is an observation."""
     found: dict[tuple[str, str], Epipolar] = {}
     doubts: dict[str, tuple[Notice, ...]] = {}
+    used: list[Matched] = []
     for (a, b), pairs in matches.items():
         if not pairs or not {a, b} <= best.problem.places.keys():
             continue
         solutions = [solution for name in (a, b) if (solution := learned[name].solution)]
         cameras = [solution.camera for solution in solutions]
-        rays, xy = rays_of(cameras, pairs, [solution.field for solution in solutions])
+        fields = [solution.field for solution in solutions]
+        rays, xy = rays_of(cameras, pairs, fields)
         across = best.problem.places[b].rotation @ best.problem.places[a].rotation.T
         scale = learned[a].scale.px
         held = fitted(rays, across, cameras[0].fx)
@@ -316,7 +300,13 @@ def _witnessed(learned: Mapping[str, Learned], best: Solved,
                     'E-RIG-EPIPOLAR', f'{name}: matches between {a} and {b} say that one is '
                     f'turned by {degrees:.2f} degrees more against the other: check that none was '
                     f'moved during the drive, or drive more turns'))
-    return found, doubts
+        elif use:
+            sigmas = [np.sqrt(np.diag(best.problem.cameras[name].lens_covariance))
+                      for name in (a, b)]
+            matched = rotation_by_matches((a, b), [each.widened() for each in cameras], pairs,
+                                          fields, across, sigmas)
+            used += [] if matched is None else [matched]
+    return Witnessed(found, doubts, tuple(used))
 
 
 def _contradicted(free: Fitted, across: Floats, best: Solved, a: str, b: str) -> float:
@@ -330,14 +320,18 @@ def _contradicted(free: Fitted, across: Floats, best: Solved, a: str, b: str) ->
     return float(np.linalg.norm(away)) if beyond.any() else 0.0
 
 
-def _metres(each: Learned) -> Metres | None:
-    """Return the speed of the car, where the drive has one."""
-    if each.drive.motion is None:
-        return None
-    speed = speeds_of(each.drive.motion.since(each.start_s))
-    if speed is None:
-        return None
-    return lambda seconds: speed.at(seconds)[:, 0]
+def _metres(learned: Mapping[str, Learned], late: Mapping[str, float]) -> Metres | None:
+    """Return the speed of the car, where a drive has one. late: of clocks, the base's first."""
+    for name, offset in late.items():
+        each = learned[name]
+        speed = each.drive.motion and speeds_of(each.drive.motion.since(each.start_s))
+        if speed:
+            return _speed(speed, offset)
+    return None
+
+
+def _speed(speed: Samples, offset: float) -> Metres:
+    return lambda seconds: speed.at(seconds + offset)[:, 0]
 
 
 # for Python ---------------------------------------------------------------------------------
@@ -345,18 +339,21 @@ def _metres(each: Learned) -> Metres | None:
 
 def calibrate_rig(drives: Mapping[str, Paths | Recording], base: str | None = None,
                   fps: float | None = None, config: Settings = None,
-                  motion: MotionOrPath = None, progress: Progress | None = None) -> Rig:
+                  motion: MotionOrPath = None, progress: Progress | None = None,
+                  match: bool = False) -> Rig:
     """Calibrate several cameras of one car from one drive, and where each sits.
 
     drives: by the cameras' names: a bag, a video, a folder of images, or several files of one
     drive; 'BAG:TOPIC' for one topic of a bag. Every camera may have its own size, rate, lens,
     shutter and clock.
-    base: the camera that the others are placed against; None: the first.
+    base: the camera that the others are placed against; None: the first one with the best lens.
     fps: images per second of a folder without times, or instead of a video's rate.
     config: the settings: a Config, or a mapping such as {'turns.wanted': 8}; None: the defaults.
-    motion: data of the car's own sensors on the clock of the base: the path of a CSV, a GPX file
-    or a KITTI oxts folder, or a stream; with a speed translations are in metres.
+    motion: data of the car's own sensors on the clock of the base, or of the first camera: the
+    path of a CSV, a GPX file or a KITTI oxts folder, or a stream; with a speed translations are in
+    metres.
     progress: called with the name of a stage and its fraction done, 0 to 1; at last 'done', 1.0.
+    match: use what two cameras see at the same time, too, not only as a witness.
 
     Returns a Rig: its rig has a PlacedCamera for each name, with a verdict for each degree of
     freedom; its calibrations have what each camera says alone. Raises InputError
@@ -364,11 +361,11 @@ def calibrate_rig(drives: Mapping[str, Paths | Recording], base: str | None = No
     cannot run.
     """
     settings = settings_of(config, None)
-    base = base or next(iter(drives), '')
+    clock = base or next(iter(drives), '')
     opened = {name: path if isinstance(path, Recording) else open_camera(
-        path, fps, motion if name == base else None) for name, path in drives.items()}
+        path, fps, motion if name == clock else None) for name, path in drives.items()}
     with Calls(progress) as observer:
-        return rig_of_drives(opened, base, settings, observer)
+        return rig_of_drives(opened, base, settings, observer, match=match)
 
 
 def open_camera(path: Paths, fps: float | None = None, motion: MotionOrPath = None) -> Recording:

@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from dashcalib_ros.ros.interface import (
+    OF_CAMERA,
     OF_RCLPY,
     PROGRAMS,
     PUBLISHED,
+    RIG,
     SERVICES,
     SET_CAMERA_INFO,
     SUBSCRIBED,
@@ -82,7 +84,7 @@ def page() -> str:
         called=SET_CAMERA_INFO, topics=_listed(OF_RCLPY['topics']),
         rclpy=_listed(OF_RCLPY['services']),
         parameters=_table(('parameter', 'default', 'values', 'program', ''), (
-            _parameter(name, spec) for name, spec in specs().items()
+            _parameter(name, spec) for name, spec in {**specs(), **specs(RIG)}.items()
             if not spec.metadata['expert'])))
 
 
@@ -109,7 +111,8 @@ def _table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
 
 
 def _of(programs: tuple[str, ...]) -> str:
-    return 'both' if programs == PROGRAMS else f'`{programs[0]}`'
+    return 'all' if programs == PROGRAMS else 'of cameras' if programs == OF_CAMERA else (
+        _listed(programs))
 
 
 def _listed(names: Iterable[str]) -> str:

@@ -27,6 +27,7 @@ ARGUMENTS = (
     ('camera_name', '', 'another name of the camera; overrides the parameter file'),
     ('image', 'image_raw', 'the image topic, without /compressed'),
     ('camera_info', 'camera_info', 'the topic on which the calibration is published'),
+    ('store', '', 'the folder of turns.store; overrides the parameter file'),
     ('image_transport', 'raw', 'raw, compressed or video; overrides the parameter file'),
     ('use_sim_time', 'false', 'true for a bag played with --clock; overrides the parameter file'),
     ('config', PathJoinSubstitution([FindPackageShare('dashcalib_ros'), 'config',
@@ -44,8 +45,9 @@ def started(context):
     """Return the node, and what changes its state, also after it was started again."""
     value = {name: LaunchConfiguration(name) for name, _, _ in ARGUMENTS}
     own = {name: value[name] for name in ('image_transport', 'use_sim_time', 'autostart')}
-    if name := value['camera_name'].perform(context):
-        own['camera_name'] = name
+    for name, parameter in (('camera_name', 'camera_name'), ('store', 'turns.store')):
+        if given := value[name].perform(context):
+            own[parameter] = given
     node = LifecycleNode(
         package='dashcalib_ros', executable=value['program'], name=value['program'],
         namespace=value['namespace'], output='screen',

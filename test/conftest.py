@@ -127,3 +127,14 @@ def make_desk(ros_context, tmp_path):
     yield make
     for each in made:
         each.close()
+
+
+@pytest.fixture
+def tf2(monkeypatch):
+    """Stand in for tf2_msgs, which is not on the package index."""
+    from types import SimpleNamespace
+
+    from dashcalib_ros.ros import car
+    monkeypatch.setitem(sys.modules, 'tf2_msgs', SimpleNamespace())
+    monkeypatch.setitem(sys.modules, 'tf2_msgs.msg', SimpleNamespace(TFMessage=SimpleNamespace))
+    monkeypatch.setattr(car, 'LISTEN_S', 0.0)

@@ -6,16 +6,22 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from dashcalib_ros.camera.rotation import rotation_matrices
 from dashcalib_ros.errors import Notice
 from dashcalib_ros.problem.trajectory import Trajectory
 from dashcalib_ros.rig.paths import CameraPaths, ScenePath
-from dashcalib_ros.rig.placed import PlacedCamera, RigCalibration, base_camera, not_placed
+from dashcalib_ros.rig.placed import PlacedCamera, RigCalibration, base_camera, not_placed, three
 from dashcalib_ros.rig.witness import Epipolar
 
 # s, degrees of each turn; m/s
 LENGTH_S, SPEED = 5.0, 6.0
+# of seen_rig(): degrees and m of each camera, rotation and translation against the front
+SIGMA, METRES = (0.06, 0.08, 0.04), (0.02, 0.5, 0.02)
+PLACES = {'left': ((1.0, 70.0, -2.0), (-0.5, 0.2, 1.0)),
+          'right': ((3.0, -75.0, 1.0), (0.6, 0.1, 1.1)),
+          'rear': ((2.0, 177.5, 1.5), (0.3, -0.2, -2.0))}
 
 
 @dataclass(frozen=True)
@@ -111,3 +117,19 @@ def front_left_rear(left: PlacedCamera, why: str) -> RigCalibration:
         'front': base_camera('front/result.json'), 'left': left,
         'rear': not_placed('rear/result.json', Notice('E-RIG-OTHER-DRIVE', why))},
         {('front', 'left'): Epipolar(900, 0.3, 0.05)})
+
+
+def seen_rig(*names, turned=None, by=(0.0, 1.0, 0.0), metric=True, seed=0):
+    """Return front and others; turned: the camera that sits otherwise, by degrees in its axes."""
+    rng, cameras = np.random.default_rng(seed), {'front': base_camera('front/result.json')}
+    by_base = Rotation.from_rotvec(by if turned == 'front' else (0, 0, 0), degrees=True)
+    for name in names:
+        vector, shift = PLACES[name]
+        own = Rotation.from_rotvec(by if turned == name else (0, 0, 0), degrees=True)
+        noise = Rotation.from_rotvec(np.array(SIGMA) * rng.normal(size=3), degrees=True)
+        turn = noise * own * Rotation.from_rotvec(vector, degrees=True) * by_base.inv()
+        moved = own.apply(shift) + np.array(METRES) * rng.normal(size=3)
+        cameras[name] = PlacedCamera(
+            f'{name}/result.json', 'accepted', three(turn.as_rotvec(degrees=True)), SIGMA,
+            three(moved) if metric else None, METRES if metric else None, 0.0, 0.001)
+    return RigCalibration('front', cameras)

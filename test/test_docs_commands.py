@@ -127,7 +127,7 @@ def reason(words):
 
 def node_arguments(words):
     """Return the program, and what a command gives to it; None if it starts no node."""
-    for program in ('calibrator', 'checker'):
+    for program in ('calibrator', 'checker', 'rig'):
         for start in ([f'dashcalib-{program}'], ['ros2', 'run', 'dashcalib_ros', program]):
             if words[:len(start)] == start:
                 return [program, *words[len(start):]]
@@ -221,7 +221,7 @@ def starts_and_stops(tmp_path):
             if 'autostart:=false' in arguments:
                 wait_for(lambda: node.catches(signal.SIGTERM))
             else:
-                node.wait_for('the turns seen on')
+                node.wait_for('by turns in' if arguments[0] == 'rig' else 'the turns seen on')
             assert node.stop() == 0, node.text
         finally:
             node.kill()

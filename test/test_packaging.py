@@ -90,7 +90,7 @@ def test_the_wheel_of_the_source_distribution_is_complete(wheel):
     expected |= {f'{share}/dashcalib_ros/{name}' for name in tracked_files()
                  if name.startswith(('config/', 'launch/')) or name == 'package.xml'}
     expected |= {f'{share.removesuffix("share")}lib/dashcalib_ros/{name}'
-                 for name in ('calibrator', 'checker')}
+                 for name in ('calibrator', 'checker', 'rig')}
     expected.add(f'{share}/ament_index/resource_index/packages/dashcalib_ros')
     assert expected - set(names) == set()
     # neither tests nor documents become somebody's top-level package

@@ -2,14 +2,21 @@
 """Pictures of two cameras of one car, ahead and back, with exact truth: from drives to a rig."""
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from made_rig import Mounted, made_paths
 from shared_drive import LENS, QUICK, SPEC
+from solving import remembered
 
 from dashcalib_ros import rig_session
-from dashcalib_ros.camera.rotation import rotation_vectors
+from dashcalib_ros.camera import Radial
+from dashcalib_ros.camera.rotation import rotation_matrices, rotation_vectors
+from dashcalib_ros.cli import demo
+from dashcalib_ros.cli.program import main
 from dashcalib_ros.cli.rig import write_rig
 from dashcalib_ros.demo import Drive, Mounting, render_to_bag, true_places
 from dashcalib_ros.errors import Notice
@@ -17,6 +24,10 @@ from dashcalib_ros.formats import load_camera
 from dashcalib_ros.formats.rig import RIG_FORMATS, load_rig
 from dashcalib_ros.input.motion import Samples, SensorStream
 from dashcalib_ros.judge import Verdict
+from dashcalib_ros.rig import live
+from dashcalib_ros.rig.joint import solved
+from dashcalib_ros.rig.live import rig_of_scenes
+from dashcalib_ros.rig.start import aligned, problem_of
 
 BACK = replace(SPEC, rolling_shutter_ms=12.0, mounting=Mounting(
     178.0, -3.0, 1.0, -0.9, -0.1, 1.2, phase_s=0.05, late_s=0.3))
@@ -85,6 +96,60 @@ def test_every_image_is_posed_as_its_shutter_saw_it(placed):
         assert len(rows) > 25 and np.sqrt(np.mean(off**2, axis=0)).max() < 0.007
 
 
+def test_turns_without_their_images_show_it_too(placed, monkeypatch):
+    """As a live drive has them: less is known, and the sigmas say so."""
+    monkeypatch.setattr(live, '_solved', remembered(live._solved))
+    _, drives, kept = placed
+    scenes = {name: solution.scenes for name, (_, solution, *_) in kept.items()}
+    rig = rig_of_scenes(scenes, dict.fromkeys(scenes, 'accepted'), 'front', 0.0, None, QUICK)
+    true, rear = true_places(drives, 'front')['rear'], rig.cameras['rear']
+    off = np.degrees(rotation_vectors((rear.rotation @ true.rotation.T)[None])[0])
+    assert np.all(np.abs(off) < 3.5 * np.array(rear.rotation_sigma_deg))
+    assert max(rear.rotation_sigma_deg) < 0.3 and rear.verdict == 'accepted'
+    assert abs(rear.time_offset_s - true.time_offset_s) < 3.5 * rear.time_sigma_s < 0.01
+    # with the turns of later than both, nothing shows where it sits
+    later = max(int(scene.tracks.stamps_ns[-1]) for scene in scenes['front']) / 1e9
+    rig = rig_of_scenes(scenes, dict.fromkeys(scenes, 'accepted'), 'front', later, None, QUICK)
+    assert [each.code for each in rig.cameras['rear'].reasons] == ['E-RIG-NO-SCENES']
+    # of one camera alone
+    rig = rig_of_scenes({**scenes, 'rear': ()}, dict.fromkeys(scenes, 'weak'), 'front', 0.0, None,
+                        QUICK)
+    assert rig.cameras['rear'].verdict == 'refused' and rig.cameras['front'].verdict == 'weak'
+
+
+@pytest.mark.parametrize('off_deg', [0.0, 2.0])
+def test_matches_are_used_unless_they_contradict_a_place(monkeypatch, off_deg):
+    """off_deg: by which the second camera is turned more in the matches."""
+    turn = rotation_matrices(np.radians([[0.5, -2.0, 1.0]]))[0]
+    paths, _ = made_paths({'front': Mounted(), 'right': Mounted((0.5, -2.0, 1.0),
+                                                                (-0.5, 0.02, 0.03))},
+                          lens_sigma=0.01)
+    best = solved(problem_of(paths, 'front', {'right': aligned(paths['right'], paths['front'])},
+                             None))
+    camera = Radial((800, 450), 520.0, 520.0, 400.0, 225.0, -0.2, 0.05)
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(6, 40, 900)
+    points = depth[:, None] * np.column_stack([
+        rng.uniform(-0.6, 0.6, 900), rng.uniform(-0.35, 0.35, 900), np.ones(900)])
+    more = rotation_matrices(np.radians([[off_deg, 0.0, 0.0]]))[0]
+    pairs = tuple(camera.project(each) + 0.2 * rng.normal(size=(900, 2)) for each in (
+        points, (points @ turn.T + [-0.5, 0.02, 0.03]) @ more.T))
+    inside = np.isfinite(pairs[0] + pairs[1]).all(axis=1)
+    one = SimpleNamespace(solution=SimpleNamespace(camera=camera, field=None),
+                          scale=SimpleNamespace(px=2.0))
+    monkeypatch.setattr(rig_session, 'rotation_by_matches', lambda pair, *given: pair)
+    for use in (False, True):
+        found = rig_session._witnessed(dict.fromkeys(paths, one), best, {('front', 'right'): [
+            tuple(side[inside] for side in pairs)]}, use)
+        if off_deg:
+            assert [each.code for each in found.doubts['right']] == ['E-RIG-EPIPOLAR']
+            assert not found.matched
+        else:
+            assert not found.doubts and found.matched == (('front', 'right'),) * use
+            # in px of the input
+            assert found.epipolar['front', 'right'].median < 0.6
+
+
 def test_a_rig_is_written_for_all_who_take_it(placed, tmp_path):
     found, _, _ = placed
     write_rig(found, tmp_path)
@@ -101,3 +166,25 @@ def test_a_rig_is_written_for_all_who_take_it(placed, tmp_path):
                for name, each in found.calibrations.items()}
     write_rig(replace(found, calibrations=refused), tmp_path)
     assert not (tmp_path / 'camchain.yaml').exists() and (tmp_path / 'rig.urdf').exists()
+
+
+@pytest.mark.thorough
+def test_the_demo_renders_a_rig_and_tells_the_truth(shared_drive, tmp_path, monkeypatch, capfd):
+    drives = {'front': shared_drive, 'rear': Drive(LENS, BACK)}
+    monkeypatch.setattr(demo, 'rig_drives', lambda seed: drives)
+    monkeypatch.setattr(demo, 'read_config', lambda args: QUICK)
+    folder = tmp_path / 'demo'
+    code = main(['demo', '--rig', '--json', '--keep-bag', '--out', str(folder)])
+    truth = json.loads((folder / 'truth.json').read_text())
+    found = load_rig(folder)
+    assert code == 0 and found.accepted and json.loads(capfd.readouterr().out)['base'] == 'front'
+    assert {'bag-front', 'bag-rear', 'front', 'rear', *RIG_FORMATS} < {
+        each.name for each in folder.iterdir()}
+    true, rear = truth['cameras']['rear'], found.cameras['rear']
+    turn = rotation_matrices(np.radians([true['rotation_deg']]))[0]
+    off = np.degrees(rotation_vectors((rear.rotation @ turn.T)[None])[0])
+    assert truth['base'] == 'front' and np.all(np.abs(off) < 3.5 * np.array(
+        rear.rotation_sigma_deg))
+    assert abs(rear.time_offset_s - true['time_offset_s']) < 3.5 * rear.time_sigma_s
+    # no speed, no metres
+    assert rear.translation_m is None

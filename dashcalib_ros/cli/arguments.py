@@ -384,12 +384,15 @@ COMMANDS = {
                          'help': f'a camera, and {INPUT_HELP}; BAG:TOPIC for one topic of a bag'}),
             ('--base', {'metavar': 'NAME',
                         'help': 'the camera that the others are placed against (default: the '
-                                'first)'}),
+                                'first one whose lens is accepted)'}),
             ('--fps', {'type': POSITIVE, 'metavar': 'F',
                        'help': 'images per second of videos or image folders'}),
             ('--motion', {'type': Path, 'metavar': 'FILE',
                           'help': 'a speed of the car, on the clock of the base: translations are '
                                   'in metres then; files as for run'}),
+            ('--match', {'action': 'store_true',
+                         'help': 'use what two cameras see at the same time, too; without it that '
+                                 'is a witness only'}),
             *SETTINGS, SEED, out_folder('rig', '; --json prints rig.json'), JSON, QUIET),
         exit_codes='exit codes: 0 every camera is accepted; 3 one is weak or refused; 2 bad input '
                    'or usage'),

@@ -49,8 +49,8 @@ def batch(args: argparse.Namespace) -> int:
     with closing(_engine(args, config)) as engine:
         try:
             with progress.stages:
-                files = calibrate_fleet(cameras, args.out, config, engine, args.shard is None,
-                                        progress.tell)
+                files, rigs = calibrate_fleet(cameras, args.out, config, engine,
+                                              args.shard is None, progress.tell)
         except KeyboardInterrupt:
             warn([Notice('E-BATCH-INTERRUPTED', f'{progress.done} of '
                          f'{counted(progress.clips, "clip")} are done and kept in {out}: the '
@@ -61,7 +61,10 @@ def batch(args: argparse.Namespace) -> int:
     if files:
         progress.screen.show(line(f'written to {out}: ' + ', '.join(files)))
     if args.json:
-        print_json(_as_dict(cameras, files))
+        print_json({**_as_dict(cameras, files), 'rigs': rigs})
+    for name, verdicts in rigs.items():
+        progress.screen.show(line(f'rig {name}: ' + (verdicts if isinstance(verdicts, str) else (
+            ', '.join(f'{camera} {level}' for camera, level in verdicts.items())))))
     return _summarise(cameras, progress.screen)
 
 

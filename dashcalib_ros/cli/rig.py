@@ -9,8 +9,7 @@ from dashcalib_ros.cli.arguments import ACCEPTED, NOT_ENOUGH, UsageError
 from dashcalib_ros.cli.drive import read_config
 from dashcalib_ros.cli.run import now
 from dashcalib_ros.cli.terminal import Screen, Stages, warn
-from dashcalib_ros.errors import ConfigError, Notice
-from dashcalib_ros.formats.rig import RIG, RIG_FORMATS, placed_cameras, rig_json
+from dashcalib_ros.formats.rig import RIG, RIG_FORMATS, placed_cameras, rig_files, rig_json
 from dashcalib_ros.report import output_folder, write_results, write_text
 from dashcalib_ros.report.files import REPORT
 from dashcalib_ros.report.rig import rig_html, rig_lines, witness_lines
@@ -22,13 +21,13 @@ from dashcalib_ros.standard_streams import write_stdout
 def rig(args: argparse.Namespace) -> int:
     """Place the cameras, write rig.json and their results; return the exit code."""
     config, inputs = read_config(args), named(args.cameras)
-    base = args.base or next(iter(inputs))
-    drives = {name: open_camera(path, args.fps, args.motion if name == base else None)
+    clock = args.base or next(iter(inputs))
+    drives = {name: open_camera(path, args.fps, args.motion if name == clock else None)
               for name, path in inputs.items()}
     screen = Screen(args.quiet, to_stderr=args.json)
     with output_folder(args.out):
         with Stages(args.quiet) as stages:
-            found = rig_of_drives(drives, base, config, stages)
+            found = rig_of_drives(drives, args.base, config, stages, match=args.match)
         write_rig(found, args.out)
     warn((*found.rig.warnings, *(
         reason for camera in found.rig.cameras.values() for reason in camera.reasons)))
@@ -60,11 +59,9 @@ def write_rig(found: Rig, out: Path) -> None:
     for name, calibration in found.calibrations.items():
         write_results(calibration, out / name, created=now())
     cameras = placed_cameras(found.rig, found.calibrations)
-    for name, write in RIG_FORMATS.items():
-        try:
-            write_text(out / name, write(cameras))
-        except ConfigError as error:
-            (out / name).unlink(missing_ok=True)
-            warn([Notice(error.code, f'{name} is not written: {error}')])
-    write_text(out / REPORT, rig_html(found.rig, cameras))
-    write_text(out / RIG, rig_json(found.rig))
+    files, missing = rig_files(found.rig, cameras)
+    warn(missing)
+    for name in RIG_FORMATS.keys() - files.keys():
+        (out / name).unlink(missing_ok=True)
+    for name, text in {REPORT: rig_html(found.rig, cameras), **files}.items():
+        write_text(out / name, text)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from dashcalib_ros.config import Config
-from dashcalib_ros.errors import ConfigError, InputError
+from dashcalib_ros.errors import ConfigError, InputError, Notice, coded
 from dashcalib_ros.fleet import lens_prior, overview, solved, storage, tables
 from dashcalib_ros.fleet.clips import (
     GONE,
@@ -30,6 +30,8 @@ from dashcalib_ros.fleet.clips import (
 from dashcalib_ros.fleet.engine import DiedError, Engine, Task
 from dashcalib_ros.fleet.fuse import fuse
 from dashcalib_ros.fleet.manifest import Row
+from dashcalib_ros.fleet.rigs import Member, place_rig
+from dashcalib_ros.judge.calibration import Level
 from dashcalib_ros.judge.conclude import versions
 from dashcalib_ros.report import Written, write_results
 from dashcalib_ros.report.files import REPORT
@@ -76,6 +78,12 @@ class Camera:
         return {name: value for name, value in found if names[name] == 1}
 
     @property
+    def rig(self) -> str:
+        """Return the rig that its rows name; '' where they name none, or several."""
+        found = {row.rig for row in self.rows}
+        return found.pop() if len(found) == 1 else ''
+
+    @property
     def gathered(self) -> list[tuple[Row, ClipResult]]:
         """Return its clips with what became of them."""
         return [(row, self.results[row.number]) for row in self.rows]
@@ -103,18 +111,21 @@ def cameras_of(rows: Sequence[Row], shard: tuple[int, int] = (1, 1)) -> list[Cam
 
 
 def batch(cameras: Sequence[Camera], out: str, config: Config, engine: Engine,
-          whole: bool = True, tell: OnProgress = lambda camera, clip: None) -> tuple[str, ...]:
-    """Calibrate cameras; return the files about all of them.
+          whole: bool = True, tell: OnProgress = lambda camera, clip: None
+          ) -> tuple[tuple[str, ...], Mapping[str, Mapping[str, Level] | str]]:
+    """Calibrate cameras; return the files about all of them, and the rigs.
 
     out: the folder for everything. whole: they are all of the manifest; of a part there is no
-    prior and no table. Raises OutputError where the tables cannot be written.
+    prior, no table and no rig. Of a rig there is the verdict of each camera, or why there is none.
+    Raises OutputError where the tables cannot be written.
     """
     _gather_and_solve(cameras, out, config, engine, tell)
     if not whole:
-        return ()
+        return (), {}
     units = [each.own.unit for each in cameras if each.own and each.own.unit]
     _publish(cameras, lens_prior.priors(units, config.fleet), out, engine)
-    return _write_tables(cameras, out)
+    rigs = _place(cameras, out, config, engine)
+    return _write_tables(cameras, out), rigs
 
 
 def _gather_and_solve(cameras: Sequence[Camera], out: str, config: Config, engine: Engine,
@@ -173,6 +184,26 @@ def _publish(cameras: Sequence[Camera], found: Mapping[str, lens_prior.ModelPrio
             _failed(camera, outcome)
         else:
             camera.row, camera.verdict = outcome, outcome['verdict']
+
+
+def _place(cameras: Sequence[Camera], out: str, config: Config, engine: Engine
+           ) -> dict[str, Mapping[str, Level] | str]:
+    members: dict[str, list[Member]] = {}
+    # in the order of the manifest: the first one is the base
+    for camera in sorted(cameras, key=lambda each: each.rows[0].number):
+        if camera.own is not None and camera.rig:
+            members.setdefault(camera.rig, []).append(
+                Member(camera.name, camera.own.file, camera.gathered))
+    found: dict[str, Mapping[str, Level] | str] = {}
+    for name, those in members.items():
+        if len(those) > 1:
+            engine.submit(Task(place_rig, (name, those, out, config), name))
+        else:
+            found[name] = str(Notice('E-RIG-ONE-CAMERA', f'only {those[0].camera} is there: name '
+                                     f'the rig in the rows of two cameras or more'))
+    for name, outcome in engine.outcomes():
+        found[name] = coded(outcome) if isinstance(outcome, Exception) else outcome
+    return dict(sorted(found.items()))
 
 
 def _write_tables(cameras: Sequence[Camera], out: str) -> tuple[str, ...]:

@@ -25,7 +25,7 @@ from dashcalib_ros.limits import MANIFEST_BYTES, MANIFEST_ROWS
 from dashcalib_ros.store.scene_file import LAST_S
 from dashcalib_ros.store.scene_file import SUFFIX as GATHERED
 
-COLUMNS = ('clip', 'camera', 'make', 'fps', 'topic', 'time', 'known', 'temperature')
+COLUMNS = ('clip', 'camera', 'make', 'fps', 'topic', 'time', 'known', 'temperature', 'rig')
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +35,8 @@ class Row:
     clip: as written, without credentials; place, which may have some, is nowhere shown or kept.
     camera: '' where it is unknown, then the clip is a camera of its own. make: '' where unknown.
     time_s: when it was recorded, s since 1970; None where unknown. known: settings known.* of its
-    camera. temperature_c: mean of the clip, degrees Celsius; None where unknown. problem: why this
-    row cannot be used, '' if it can.
+    camera. temperature_c: mean of the clip, degrees Celsius; None where unknown. rig: of the car
+    that its camera is on, '' where unknown. problem: why this row cannot be used, '' if it can.
     """
 
     number: int
@@ -50,6 +50,7 @@ class Row:
     problem: str = ''
     known: tuple[tuple[str, str], ...] = ()
     temperature_c: float | None = None
+    rig: str = ''
 
     @property
     def name(self) -> str:
@@ -176,12 +177,12 @@ READERS: dict[str, Callable[[str, bytes], Iterator[Values]]] = {
 def _row(number: int, values: Values, folder: str) -> Row:
     if isinstance(values, str):
         return Row(number, '', '', problem=values)
-    clip, camera, make, fps, topic, time, known, temperature = (
+    clip, camera, make, fps, topic, time, known, temperature, rig = (
         '' if values.get(name) is None else str(values[name]).strip() for name in COLUMNS)
     if not clip:
         return Row(number, '', '', camera, make, problem='names no clip')
     row = Row(number, storage.masked(clip), storage.joined(folder, clip), camera, make,
-              topic=topic or None)
+              topic=topic or None, rig=rig)
     try:
         return replace(row, fps=_rate(fps) if fps else None, time_s=_time(time) if time else None,
                        known=_known(known),

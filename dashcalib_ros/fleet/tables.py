@@ -112,10 +112,13 @@ def failed_row(camera: str, make: str, clips: Sequence[Mapping[str, Any]],
 
 def camera_folder(camera: str) -> str:
     """Return the folder of a camera's files; different names never share one."""
-    plain = re.sub(r'[^A-Za-z0-9._-]+', '_', camera).strip('._')[:80]
-    if plain == camera and not HASHED.search(camera):
-        return f'cameras/{camera}'
-    return f'cameras/{plain}-{hash_of([camera])}'
+    return f'cameras/{folder_name(camera)}'
+
+
+def folder_name(name: str) -> str:
+    """Return the name of a folder for a name; different names never share one."""
+    plain = re.sub(r'[^A-Za-z0-9._-]+', '_', name).strip('._')[:80]
+    return name if plain == name and not HASHED.search(name) else f'{plain}-{hash_of([name])}'
 
 
 def clip_rows(camera: str, make: str, clips: Sequence[tuple[Row, ClipResult]],

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from dashcalib_ros.arrays import plain_values
-from dashcalib_ros.errors import InputError, Notice, one_line
+from dashcalib_ros.errors import ConfigError, InputError, Notice, one_line
 from dashcalib_ros.formats import calibrators, colmap, photogrammetry, urdf
 from dashcalib_ros.formats.ours import codes_of
 from dashcalib_ros.formats.values import Placed
@@ -68,6 +68,18 @@ def placed_cameras(rig: RigCalibration, calibrations: Mapping[str, CalibrationDa
     return found
 
 
+def rig_files(rig: RigCalibration, cameras: Sequence[Placed]
+              ) -> tuple[dict[str, str], tuple[Notice, ...]]:
+    """Return RIG_FORMATS and rig.json by their names, and which of them cannot be written."""
+    found, missing = {}, []
+    for name, write in RIG_FORMATS.items():
+        try:
+            found[name] = write(cameras)
+        except ConfigError as error:
+            missing.append(Notice(error.code, f'{name} is not written: {error}'))
+    return {**found, RIG: rig_json(rig)}, tuple(missing)
+
+
 def _place(path: str | os.PathLike[str]) -> Path:
     place = path_of(path)
     return place / RIG if place.is_dir() else place
@@ -88,7 +100,12 @@ def load_rig(path: str | os.PathLike[str]) -> RigCalibration:
     Raises InputError for what is no rig.json.
     """
     place = _place(path)
-    data = parse_json(read_text(place, JSON_BYTES), str(place))
+    return parse_rig(read_text(place, JSON_BYTES), str(place))
+
+
+def parse_rig(text: str, place: str) -> RigCalibration:
+    """Return what the text of a rig.json says; place: where it is from. Raises InputError."""
+    data = parse_json(text, place)
     try:
         cameras = {str(name): _camera(values) for name, values in data['cameras'].items()}
         names = {f'{a}-{b}': (a, b) for a in cameras for b in cameras}

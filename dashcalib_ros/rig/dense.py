@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dashcalib_ros.arrays import Mask
+from dashcalib_ros.arrays import GreyImage, Mask
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.input import Frame
@@ -56,20 +56,30 @@ def retraced(frames: Sequence[Frame], scene: Scene, solution: Solution, config: 
     if not tracks.xy.shape[1]:
         return None
     tracks = spread(tracks, TRACKS)
+    first_ns = scene.tracks.stamps_ns[scene.structure.registered][0]
+    rotations, translations = scene.trajectory.at((tracks.stamps_ns - first_ns) / 1e9)
+    count = tracks.xy.shape[1]
+    return _posed(replace(scene, tracks=tracks, structure=Structure(
+        rotations, translations, np.zeros((count, 3)), np.ones(len(tracks.frames), bool),
+        np.zeros(tracks.seen.shape, bool))), solution, config, [frame.image for frame in frames])
+
+
+def posed(scene: Scene, solution: Solution, config: Config) -> Retraced | None:
+    """Return a scene with the solution's lens where there are no images: only its keyframes."""
+    return _posed(scene, solution, config)
+
+
+def _posed(scene: Scene, solution: Solution, config: Config, images: Sequence[GreyImage] = ()
+           ) -> Retraced | None:
+    tracks = scene.tracks
     if solution.field is not None:
         xy, seen = tracks.xy.copy(), tracks.seen
         xy[seen] = solution.field.ideal(xy[seen])
         tracks = replace(tracks, xy=xy)
-    first_ns = scene.tracks.stamps_ns[scene.structure.registered][0]
-    rotations, translations = scene.trajectory.at((tracks.stamps_ns - first_ns) / 1e9)
-    count = tracks.xy.shape[1]
-    found = replace(scene, tracks=tracks, camera=solution.camera, structure=Structure(
-        rotations, translations, np.zeros((count, 3)), np.ones(len(tracks.frames), bool),
-        np.zeros(tracks.seen.shape, bool)))
+    found = replace(scene, tracks=tracks, camera=solution.camera)
     imaging = imaging_of(solution, held=True)
-    images = [frame.image for frame in frames]
     for number, error_px in enumerate(ROUNDS_PX):
-        if number == REGISTERED:
+        if number == REGISTERED and images:
             tracks = register_tracks(tracks, found.structure, solution.camera, images)
             found = replace(found, tracks=tracks)
         whole = retriangulated(imaging.as_lens_sees(found), solution.camera, error_px,

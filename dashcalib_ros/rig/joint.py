@@ -38,8 +38,8 @@ PLACE, GAUGE = 8, 7
 # one sigma of priors. m: cameras of a car are not farther apart. log: of the metres of a scene's
 # unit, where no speed is known. Of time: quartz clocks differ by less
 REACH_M, UNKNOWN_UNIT, PACE = 2.0, 0.7, 1e-4
-# steps of the problem; before some of them the noise is weighed anew
-STEPS, WEIGHED = 12, (3, 6)
+# steps of the problem at the most; before some of them the noise is weighed anew
+STEPS, WEIGHED = 30, (3, 6)
 # of steps, in sigmas; below it they end
 SETTLED = 0.02
 # s: noise between keyframes is that of knots so far apart, times the square of how far they are
@@ -166,11 +166,27 @@ class Rows:
 
 
 @dataclass(frozen=True)
+class Matched:
+    """The rotation from camera a's axes to b's (3, 3) that matches of both show.
+
+    covariance: (3, 3) of small rotations in b's axes. follow: by camera, (3, n) of these by its
+    lens.
+    """
+
+    a: str
+    b: str
+    rotation: Floats
+    covariance: Floats
+    follow: Mapping[str, Floats]
+
+
+@dataclass(frozen=True)
 class Problem:
     """The present state of a rig.
 
     places: of all cameras. units: log of the metres in a unit of each reference scene; unit_known:
     its prior, value and sigma. lenses: (n,) how far each camera's lens is off its own solution.
+    matched: what else shows rotations.
     """
 
     cameras: Mapping[str, CameraPaths]
@@ -181,6 +197,7 @@ class Problem:
     lenses: Mapping[str, Floats]
     pairs: tuple[Pair, ...]
     noise: Noise = Noise()
+    matched: tuple[Matched, ...] = ()
 
     def scene(self, key: SceneKey) -> ScenePath:
         """Return a scene by its camera and number."""
@@ -328,7 +345,28 @@ class Problem:
                 inverse = np.diag([0, 0, 0, *[REACH_M**-2] * 3, 0, PACE**-2])
                 information[place, place] = inverse
                 score[place] = -inverse @ [0, 0, 0, *own.translation_m, 0, own.pace]
+        for each in self.matched:
+            off, jacobian = self.off_matches(each, count)
+            # lenses are put back in the end: what follows them is no better known than they are
+            covariance = each.covariance + sum(
+                follow @ self.cameras[name].lens_covariance @ follow.T
+                for name, follow in each.follow.items())
+            weighted = np.linalg.solve(covariance, jacobian).T
+            information += weighted @ jacobian
+            score += weighted @ off
         return information, score
+
+    def off_matches(self, found: Matched, count: int) -> tuple[Floats, Floats]:
+        """Return (3,) measured less predicted, and (3, m) derivatives of what is predicted."""
+        across = self.places[found.b].rotation @ self.places[found.a].rotation.T
+        off, jacobian = logarithms((found.rotation @ across.T)[None])[0], np.zeros((3, count))
+        for name, turn in ((found.a, -across), (found.b, np.eye(3))):
+            if name != self.base:
+                jacobian[:, self.where[name]][:, :3] = turn
+            # what was measured follows the lens
+            jacobian[:, self.where['lens', name]] = -found.follow[name]
+            off = off + found.follow[name] @ self.lenses[name]
+        return off, jacobian
 
     def moved(self, step: Floats) -> Problem:
         """Return the problem a step (m,) away."""
@@ -351,13 +389,15 @@ class Solved:
     """The optimum given each camera's own lens. covariance: (m, m); own: by camera, by group.
 
     Of a group these are (PLACE,) how far it is off all, and (PLACE,) its variances.
-    lens_distance: by camera, by how many of its own sigmas paths would move its lens.
+    lens_distance: by camera, by how many of its own sigmas paths would move its lens. settled:
+    whether the steps came to an end.
     """
 
     problem: Problem
     covariance: Floats
     own: Mapping[str, Sequence[tuple[Floats, Floats]]]
     lens_distance: Mapping[str, float]
+    settled: bool = True
 
     def sigma(self, name: str) -> Floats:
         """Return (PLACE,) the sigmas of a camera, larger where its stretches differ by more."""
@@ -377,6 +417,7 @@ class Solved:
 
 def solved(problem: Problem) -> Solved:
     """Return the optimum of a problem near it."""
+    settled = False
     for number in range(STEPS):
         groups = [problem.linearised(members) for members in problem.groups]
         if number in WEIGHED:
@@ -386,7 +427,8 @@ def solved(problem: Problem) -> Solved:
             groups = [rows.without_outliers(problem.noise, step) for rows in groups]
             step, information, _ = _step(problem, groups)
         problem = problem.moved(_shortened(problem, step))
-        if number > max(WEIGHED) and step @ information @ step < SETTLED**2:
+        settled = bool(number > max(WEIGHED) and step @ information @ step < SETTLED**2)
+        if settled:
             break
     prior, _ = problem.prior()
     covariance = np.asarray(np.linalg.inv(information), np.float64)
@@ -402,7 +444,7 @@ def solved(problem: Problem) -> Solved:
             own[name].append((away[place], np.diag(alone)[place]))
     distances = {name: distance(value, problem.cameras[name].lens_covariance)
                  for name, value in problem.lenses.items()}
-    return Solved(*_with_own_lenses(problem, covariance), own, distances)
+    return Solved(*_with_own_lenses(problem, covariance), own, distances, settled)
 
 
 def _with_own_lenses(problem: Problem, covariance: Floats) -> tuple[Problem, Floats]:
@@ -454,11 +496,13 @@ def _weighed(problem: Problem, groups: Sequence[Rows]) -> Noise:
     return Noise(*sizes.tolist())
 
 
-# rad, m, logarithms: the farthest a step goes
+# rad, s, logarithms: the farthest a step goes; of metres all is linear
 LONGEST = 0.5
+METRES = slice(3, 6)
 
 
 def _shortened(problem: Problem, step: Floats) -> Floats:
-    places = [step[place] for name, place in problem.where.items() if name[0] != 'lens']
+    places = [np.delete(step[place], METRES) for name, place in problem.where.items()
+              if name[0] != 'lens']
     return np.asarray(step * min(1.0, LONGEST / max(float(np.abs(np.concatenate(places)).max()),
                                                     1e-12)))

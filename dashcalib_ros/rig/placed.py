@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -16,8 +16,9 @@ from dashcalib_ros.config import RigConfig
 from dashcalib_ros.errors import Notice
 from dashcalib_ros.judge.calibration import Level
 from dashcalib_ros.judge.difference import limit_of
-from dashcalib_ros.rig.joint import REACH_M, Solved
-from dashcalib_ros.rig.start import LEAST_EXPLAINED, Aligned
+from dashcalib_ros.rig.joint import REACH_M, Matched, Solved, solved
+from dashcalib_ros.rig.paths import CameraPaths
+from dashcalib_ros.rig.start import LEAST_EXPLAINED, Aligned, Metres, problem_of
 from dashcalib_ros.rig.witness import Epipolar
 
 Sight = Literal['accepted', 'weak', 'not visible']
@@ -97,6 +98,76 @@ class RigCalibration:
         return all(camera.verdict == 'accepted' for camera in self.cameras.values())
 
 
+@dataclass(frozen=True)
+class Alone:
+    """What is known of a camera without the others. calibration: the path of its result.
+
+    level: of its lens. start_s: stamp of its first image. scenes: how many may say where it sits.
+    """
+
+    calibration: str
+    level: Level
+    start_s: float
+    scenes: int
+
+
+@dataclass(frozen=True)
+class Witnessed:
+    """What cameras see together. doubts: what of that contradicts a camera's place.
+
+    matched: rotations that are to be used as observations.
+    """
+
+    epipolar: Mapping[tuple[str, str], Epipolar] = field(default_factory=dict)
+    doubts: Mapping[str, tuple[Notice, ...]] = field(default_factory=dict)
+    matched: tuple[Matched, ...] = ()
+
+
+def best_base(levels: Mapping[str, Level]) -> str:
+    """Return the first camera of those with the best lenses: a refused one keeps no other one."""
+    return min(levels, key=lambda name: ('accepted', 'weak', 'refused').index(levels[name]))
+
+
+def rig_of_paths(alone: Mapping[str, Alone], base: str, turned: Mapping[str, Aligned | None],
+                 paths: Mapping[str, CameraPaths], metres: Metres | None, limits: RigConfig,
+                 witnessed: Callable[[Solved], Witnessed] = lambda best: Witnessed(),
+                 car: Floats | None = None) -> RigCalibration:
+    """Return where the cameras of one car sit.
+
+    turned: of each but the base, how its turning fits to the base's. metres: None: unknown. car:
+    (3, 3) from the base's optical axes to the car's; None: unknown.
+    """
+    there = {name for name, each in paths.items() if each.scenes}
+    kept = {name: each for name, each in turned.items()
+            if each is not None and each.found and {base, name} <= there}
+    problem = problem_of(paths, base, kept, metres) if kept else None
+    best = solved(problem) if problem and problem.pairs else None
+    doubts = {name: lens_doubts(name, each.level) for name, each in alone.items()}
+    seen = Witnessed()
+    if problem is not None and best is not None:
+        seen = witnessed(best)
+        if seen.matched:
+            best = solved(replace(problem, matched=seen.matched))
+            seen = replace(seen, epipolar=witnessed(best).epipolar)
+        doubts = {name: (*each, *(apart_doubts(name, best) if name in best.problem.lenses else ()),
+                         *unsettled_doubts(name, best), *seen.doubts.get(name, ()))
+                  for name, each in doubts.items()}
+    cameras: dict[str, PlacedCamera] = {}
+    for name, own in alone.items():
+        if name == base:
+            cameras[name] = base_camera(own.calibration, doubts[name])
+        elif best is None or name not in best.problem.places:
+            lacking = next((each for each in (name, base) if not alone[each].scenes), None)
+            cameras[name] = not_placed(own.calibration, why_not_aligned(
+                name, base, turned.get(name), lacking))
+        else:
+            cameras[name] = placed(
+                name, own.calibration, best, metres is not None, own.start_s - alone[base].start_s,
+                limits, (*doubts[name], *base_doubts(name, base, doubts[base])))
+    return RigCalibration(base, cameras, seen.epipolar,
+                          () if car is None else misnamed(cameras, car))
+
+
 def lens_doubts(name: str, level: Level) -> tuple[Notice, ...]:
     """Return why a camera's lens keeps its rotation from being accepted; nothing where none."""
     return () if level == 'accepted' else (Notice(
@@ -110,6 +181,13 @@ def apart_doubts(name: str, solved: Solved) -> tuple[Notice, ...]:
         len(solved.problem.lenses[name])) else (Notice(
             'E-RIG-LENS-APART', f'{name}: the other cameras ask for another lens than its own '
             f'turns show: check that it was not moved during the drive, or drive more turns'),)
+
+
+def unsettled_doubts(name: str, solved: Solved) -> tuple[Notice, ...]:
+    """Return that the problem has no end, or none."""
+    return () if solved.settled else (Notice(
+        'E-RIG-UNSETTLED', f'{name}: no place of the cameras fits best: check that all clips are '
+        f'of one car, and leave out one camera after another'),)
 
 
 def base_doubts(name: str, base: str, doubts: Sequence[Notice]) -> tuple[Notice, ...]:
@@ -132,10 +210,10 @@ def not_placed(calibration: str, reason: Notice) -> PlacedCamera:
     return PlacedCamera(calibration, 'refused', reasons=(reason,))
 
 
-def why_not_aligned(name: str, base: str, found: Aligned | None, scenes: int) -> Notice:
-    """Return why a camera's turning does not fit the base's."""
-    if not scenes:
-        return Notice('E-RIG-NO-SCENES', f'{name}: no stretch of its drive could be '
+def why_not_aligned(name: str, base: str, found: Aligned | None, lacking: str | None) -> Notice:
+    """Return why a camera's turning does not fit the base's. lacking: which one has no scenes."""
+    if lacking:
+        return Notice('E-RIG-NO-SCENES', f'{lacking}: no stretch of its drive could be '
                       f'reconstructed: check its pictures, or drive turns past houses')
     if found is None or found.turned == 0.0:
         return Notice('E-RIG-NO-SHARED', f'{name} and {base} have no turn in common: check that '

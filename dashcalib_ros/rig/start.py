@@ -67,17 +67,19 @@ class Aligned:
         return bool(self.rotation[1, 1] < 0)
 
 
-def aligned(camera: CameraPaths, base: CameraPaths, near_s: float | None = None
-            ) -> Aligned | None:
+def aligned(camera: CameraPaths, base: CameraPaths, near_s: float | None = None,
+            within_s: float = np.inf) -> Aligned | None:
     """Return how a camera's clock and axes fit to another's; None without any shared turning.
 
-    near_s: of how late it is, where both have one clock.
+    near_s: of how late it is, where both have one clock; within_s: how far it may be from that.
     """
     spans = [(own.seconds[0] - its.seconds[-1], own.seconds[-1] - its.seconds[0])
              for own in camera.scenes for its in base.scenes]
     if not spans:
         return None
     low, high = min(low for low, _ in spans), max(high for _, high in spans)
+    if near_s is not None:
+        low, high = max(low, near_s - within_s), min(high, near_s + within_s)
     tried = np.arange(low, high + COARSE_S, COARSE_S)
     tried = np.array([late for late in tried if any(a < late < b for a, b in spans)])
     scores = np.array([_score(camera, base, late)[0] for late in tried])

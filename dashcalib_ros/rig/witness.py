@@ -16,8 +16,9 @@ from dashcalib_ros.arrays import Floats, GreyImage
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.field import Field
 from dashcalib_ros.camera.mapping import grid_of
-from dashcalib_ros.camera.rotation import rotation_matrices
+from dashcalib_ros.camera.rotation import rotation_matrices, rotation_vectors
 from dashcalib_ros.judge.mount import epipolar
+from dashcalib_ros.rig.joint import Matched
 from dashcalib_ros.robust import cauchy_weights
 
 # of a match's distance to that of the second best one (Lowe 2004), and features of a picture
@@ -106,6 +107,42 @@ def fitted(rays: tuple[Floats, Floats], rotation: Floats, px: float, free: bool 
     if free:
         covariance += variance * np.linalg.inv(hessian)[:3, :3]
     return Fitted(turned[0], errors, inside, covariance)
+
+
+# degrees; what no rotation by matches is better than
+MATCHED_DEG = 0.02
+
+
+def rotation_by_matches(pair: tuple[str, str], cameras: Sequence[Camera],
+                        matches: Sequence[tuple[Floats, Floats]],
+                        fields: Sequence[Field | None], across: Floats,
+                        lens_sigmas: Sequence[Floats]) -> Matched | None:
+    """Return the rotation that matches of two cameras show, and how it follows both lenses.
+
+    cameras: in the widest models of their kinds. across: (3, 3) near it. lens_sigmas: (n,) of each
+    camera's parameters; what a lens has more than these does not move it.
+    """
+    def rotation(each: Sequence[Camera], near: Floats) -> Fitted | None:
+        return fitted(rays_of(each, matches, fields)[0], near, each[0].fx, free=True)
+
+    found = rotation(cameras, across)
+    if found is None:
+        return None
+    follow = {}
+    for side, name in enumerate(pair):
+        params, sigmas = cameras[side].params, lens_sigmas[side]
+        follow[name] = np.zeros((3, len(sigmas)))
+        for column in range(len(params)):
+            step = sigmas[column] * np.eye(len(params))[column]
+            others = list(cameras)
+            others[side] = cameras[side].with_params(params + step)
+            moved = rotation(others, found.rotation)
+            if moved is None:
+                return None
+            follow[name][:, column] = rotation_vectors(
+                (moved.rotation @ found.rotation.T)[None])[0] / sigmas[column]
+    return Matched(*pair, found.rotation, found.covariance + np.radians(MATCHED_DEG)**2
+                   * np.eye(3), follow)
 
 
 def _first_direction(turned: Floats, second: Floats) -> Floats:

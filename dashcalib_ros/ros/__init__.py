@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from dashcalib_ros.errors import ConfigError, DashcalibError, coded
-from dashcalib_ros.ros.interface import CALIBRATOR, CHECKER
+from dashcalib_ros.ros.interface import CALIBRATOR, CHECKER, RIG
 from dashcalib_ros.standard_streams import open_closed_streams, write_stderr, write_stdout
 from dashcalib_ros.workers.worker import prepare_process
 
@@ -29,6 +29,11 @@ def calibrator() -> int:
 def checker() -> int:
     """Run the program checker."""
     return main(CHECKER)
+
+
+def rig() -> int:
+    """Run the program rig."""
+    return main(RIG)
 
 
 def main(program: str, argv: Sequence[str] | None = None) -> int:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""python -m dashcalib_ros.ros [calibrator | checker] ...: without the installed commands."""
+"""python -m dashcalib_ros.ros [calibrator | checker | rig] ...: without the installed commands."""
 import sys
 
 from dashcalib_ros.ros import main

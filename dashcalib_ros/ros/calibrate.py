@@ -33,7 +33,7 @@ OLD_S, LEAST_PX = 60.0, 0.01
 class Calibrating:
     """At most one calibration is in use; its topics and its file are always changed together.
 
-    drive: gives it results. summary: what it does, for the log.
+    drive: gives it results. inputs: of the images. summary: what it does, for the log.
     """
 
     def __init__(self, endpoints: Endpoints, settings: Settings, camera_name: str) -> None:
@@ -62,6 +62,7 @@ class Calibrating:
         # turns of this drive, with their bank, that were in a contradiction that was counted
         self._counted: frozenset[tuple[int, TurnId]] = frozenset()
         self.drive = Drive(endpoints, settings, camera_name, self)
+        self.inputs = self.drive.images
         endpoints.service('~/calibrate', self.drive.calibrate)
         endpoints.service('~/calibrate_now', self.drive.calibrate_now)
         endpoints.service('~/reset', self.reset)

@@ -40,6 +40,49 @@ LINK, ON_ROAD = 'base_link', 'base_footprint'
 AddMeasurement = Callable[[str, float, Sequence[float]], None]
 
 
+class Transforms:
+    """Publishes static transforms, once others had the time to say what frames they have.
+
+    send: publishes a message; None with ROS 2 from pip.
+    """
+
+    def __init__(self, endpoints: Endpoints) -> None:
+        self._since = time.monotonic()
+        # the parent of each frame, as others publish it
+        self._parents: dict[str, str] = {}
+        self.send: Callable[[Any], None] | None = None
+        try:
+            self.send = endpoints.latched(TF_STATIC)
+            endpoints.subscription(TF_STATIC, self._listen)
+        except ImportError:
+            endpoints.complaints.once(
+                'static transforms are not possible with ROS 2 from pip, which has no tf2_msgs: '
+                'install ROS 2 from apt, or give the output of dashcalib export --to tf, or '
+                'static_transforms.sh of dashcalib rig, to a computer that has it')
+
+    @property
+    def ready(self) -> bool:
+        """Return whether it is time to publish."""
+        return self.send is not None and time.monotonic() - self._since >= LISTEN_S
+
+    def taken(self, *steps: tuple[str, str]) -> str:
+        """Return why a step, parent and child, cannot be published; '' where all can be."""
+        for parent, child in steps:
+            if self._parents.get(child, parent) != parent:
+                return (f'the frame {child} already has the parent {self._parents[child]}, and it '
+                        f'can have only one')
+        return ''
+
+    def publish(self, transforms: Sequence[TransformStamped]) -> None:
+        """Publish them in the place of those before."""
+        assert self.send is not None
+        self.send(message_class(PUBLISHED[TF_STATIC].type)(transforms=list(transforms)))
+
+    def _listen(self, message: Any) -> None:
+        self._parents.update({each.child_frame_id.lstrip('/'): each.header.frame_id.lstrip('/')
+                              for each in message.transforms})
+
+
 class Mounting:
     """Publishes the mounting on ~/mount, and with publish_tf once on /tf_static.
 
@@ -56,22 +99,9 @@ class Mounting:
         self._pose = endpoints.latched('~/mount')
         self._sent: Mount | None = None
         self._waiting: tuple[Mount, str] | None = None
-        self._since = time.monotonic()
-        # the parent of each frame, as others publish it
-        self._parents: dict[str, str] = {}
-        self._transforms = self._publisher(endpoints) if own.publish_tf else None
-        if self._transforms is not None:
-            endpoints.subscription(TF_STATIC, self._listen)
+        self._transforms = Transforms(endpoints) if own.publish_tf else None
+        if self._transforms and self._transforms.send:
             endpoints.timer(LISTEN_S / 2, self.tick)
-
-    def _publisher(self, endpoints: Endpoints) -> Callable[[Any], None] | None:
-        try:
-            return endpoints.latched(TF_STATIC)
-        except ImportError:
-            self._warn('publish_tf is not possible with ROS 2 from pip, which has no tf2_msgs: '
-                       'install ROS 2 from apt, or give the output of dashcalib export --to tf '
-                       'to a computer that has it; ~/mount has the pose')
-            return None
 
     def show(self, mount: Mount | None, frame_id: str) -> None:
         """Publish a mounting; None: there is none. frame_id: of the images."""
@@ -79,21 +109,20 @@ class Mounting:
         if mount is None:
             return
         self._pose(self._message(mount))
-        if self._transforms is not None and mount.verdict == 'accepted':
+        if self._transforms and self._transforms.send and mount.verdict == 'accepted':
             self._waiting = mount, self._own.camera_frame or frame_id
 
     def tick(self) -> None:
         """Send the transforms that wait, once others had the time to publish theirs."""
-        if self._waiting is None or time.monotonic() - self._since < LISTEN_S:
+        transforms = self._transforms
+        if self._waiting is None or transforms is None or not transforms.ready:
             return
         (mount, frame), self._waiting = self._waiting, None
         if why := self._not_sent(mount, frame):
             self._warn(f'no static transform is published: {why}')
         elif self._sent is None or differs(mount, self._sent):
             self._sent = mount
-            assert self._transforms is not None
-            self._transforms(message_class(PUBLISHED[TF_STATIC].type)(
-                transforms=self._tree(mount, frame)))
+            transforms.publish(self._tree(mount, frame))
             self._log.info(f'static transforms {self.frame} -> {link_of(frame)} -> {frame}: '
                            f'{mount_text(mount)}')
 
@@ -107,16 +136,9 @@ class Mounting:
             return f'set {", ".join(missing)}, measured by hand' + (
                 ', or give the speed, from which the height is estimated'
                 if 'mount_z' in missing and self.frame != LINK else '')
-        for child, parent in ((link_of(frame), self.frame), (frame, link_of(frame))):
-            if self._parents.get(child, parent) != parent:
-                return (f'the frame {child} already has the parent {self._parents[child]}, and it '
-                        f'can have only one; set publish_tf to false, or camera_frame to another '
-                        f'name')
-        return ''
-
-    def _listen(self, message: Any) -> None:
-        self._parents.update({each.child_frame_id.lstrip('/'): each.header.frame_id.lstrip('/')
-                              for each in message.transforms})
+        assert self._transforms is not None
+        taken = self._transforms.taken((self.frame, link_of(frame)), (link_of(frame), frame))
+        return taken and f'{taken}; set publish_tf to false, or camera_frame to another name'
 
     def _message(self, mount: Mount) -> PoseWithCovarianceStamped:
         message = PoseWithCovarianceStamped(header=self._header(self.frame))

@@ -30,7 +30,7 @@ SAYS = {'right': 'is right: ', 'differs': '', 'wrong': 'is wrong: '}
 class Checking:
     """Publishes on ~/check, latched, whether the calibration that a driver publishes is right.
 
-    drive: gives it results. summary: what it does, for the log.
+    drive: gives it results. inputs: of the images. summary: what it does, for the log.
     """
 
     def __init__(self, endpoints: Endpoints, settings: Settings, camera_name: str) -> None:
@@ -46,6 +46,7 @@ class Checking:
         self._problem = f'no camera_info on {self._given_topic} yet'
         self._answers = endpoints.latched('~/check')
         self.drive = Drive(endpoints, settings, camera_name, self)
+        self.inputs = self.drive.images
         endpoints.subscription('camera_info', self._on_info)
         for name, action in (('calibrate', self.drive.calibrate),
                              ('calibrate_now', self.drive.calibrate_now)):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The topics and services of both programs, each in one place; no ROS is imported.
+"""The topics and services of all programs, each in one place; no ROS is imported.
 
 The endpoints are made from these tables, and --help and docs/ros_interface.md are written from
 them.
@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-CALIBRATOR, CHECKER = 'calibrator', 'checker'
-PROGRAMS = (CALIBRATOR, CHECKER)
+CALIBRATOR, CHECKER, RIG = 'calibrator', 'checker', 'rig'
+# those of one camera
+OF_CAMERA = (CALIBRATOR, CHECKER)
+PROGRAMS = (*OF_CAMERA, RIG)
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,7 @@ class Topic:
     depth: int = 10
     latched: bool = False
     reliable: bool = True
-    programs: tuple[str, ...] = PROGRAMS
+    programs: tuple[str, ...] = OF_CAMERA
     always: bool = False
 
     @property
@@ -56,7 +58,10 @@ PUBLISHED = _by_name(
           'with a variance of 1e6 m²', 1, latched=True, programs=(CALIBRATOR,)),
     Topic(TF_STATIC, 'tf2_msgs/msg/TFMessage',
           'with publish_tf: base_frame to camera_link to the optical frame when the mounting is '
-          'accepted, and again after it moved', 1, latched=True, programs=(CALIBRATOR,)),
+          'accepted, and again after it moved; of a rig, the optical frame of the base to the '
+          'others', 1, latched=True, programs=(CALIBRATOR, RIG)),
+    Topic('~/result', 'std_msgs/msg/String',
+          'rig.json of the rig that was accepted last', 1, latched=True, programs=(RIG,)),
     Topic('~/turn_magnitude', 'std_msgs/msg/Float64',
           'how much the car turns, relative to the image width; for plots'),
     Topic('~/overlay/compressed', 'sensor_msgs/msg/CompressedImage',
@@ -65,7 +70,7 @@ PUBLISHED = _by_name(
           'the picture that P of camera_info describes, while someone subscribes', 1),
     Topic('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray',
           'the state and what is missing, once a second, also while the node is inactive',
-          always=True))
+          programs=PROGRAMS, always=True))
 
 # topics of sensors, which are subscribed with use_imu and so on, and the options of the command
 # that have the same
@@ -78,13 +83,17 @@ SUBSCRIBED = _by_name(
     Topic('camera_info', 'sensor_msgs/msg/CameraInfo',
           "the driver's, which is checked", 5, reliable=False, programs=(CHECKER,)),
     Topic(TF_STATIC, 'tf2_msgs/msg/TFMessage',
-          'with publish_tf: a frame that has another parent gets none', 100, latched=True,
-          programs=(CALIBRATOR,)),
+          'with publish_tf, and of a rig: a frame that has another parent gets none', 100,
+          latched=True, programs=(CALIBRATOR, RIG)),
+    Topic('NAME/calibrator/calibration', 'sensor_msgs/msg/CameraInfo',
+          'of each of the cameras: whether its lens is accepted, and its frame', 1, latched=True,
+          programs=(RIG,)),
     # best effort also receives from reliable publishers; a second of a fast gyro
     Topic('imu', 'sensor_msgs/msg/Imu', 'with use_imu: independent evidence for fx', 400,
           reliable=False),
-    Topic('odom', 'nav_msgs/msg/Odometry', 'with use_odom: the speed, for the height of the '
-                                           'camera', 400, reliable=False),
+    Topic('odom', 'nav_msgs/msg/Odometry', 'with use_odom: the speed, for the height of a camera '
+                                           'and the metres of a rig', 400, reliable=False,
+          programs=PROGRAMS),
     Topic('fix', 'sensor_msgs/msg/NavSatFix', 'with use_fix: independent evidence for fx', 400,
           reliable=False),
     Topic('temperature', 'sensor_msgs/msg/Temperature',
@@ -107,14 +116,15 @@ class Service:
 
     name: str
     about: str
-    programs: tuple[str, ...] = PROGRAMS
+    programs: tuple[str, ...] = OF_CAMERA
 
 
 SERVICES = (
     Service('~/calibrate', 'calibrates with the turns that exist, and answers when it is done: '
                            'success where the result is accepted, or says right or wrong'),
     Service('~/calibrate_now', 'begins the same and answers at once'),
-    Service('~/reset', 'forgets the turns, also stored ones, and moves the calibration aside'),
+    Service('~/reset', 'forgets the turns, also stored ones, and moves the calibration aside; of '
+                       'a rig, forgets where the cameras sat', PROGRAMS),
     Service('~/save', 'writes the file of the calibration again', (CALIBRATOR,)))
 # that a calibrator calls with commit
 SET_CAMERA_INFO = 'set_camera_info'

@@ -18,7 +18,7 @@ from dashcalib_ros.ros.calibrate import Calibrating
 from dashcalib_ros.ros.check import Checking
 from dashcalib_ros.ros.diagnostics import Complaints, Log
 from dashcalib_ros.ros.endpoints import Endpoints
-from dashcalib_ros.ros.interface import CALIBRATOR, CHECKER
+from dashcalib_ros.ros.interface import CALIBRATOR, CHECKER, RIG
 from dashcalib_ros.ros.parameters import (
     camera_name,
     changed,
@@ -27,11 +27,12 @@ from dashcalib_ros.ros.parameters import (
     refusal,
     unknown_text,
 )
+from dashcalib_ros.ros.place import Placing
 
 # s between two looks at the publishers of images; a signal that ends the node waits no longer
 LOOK_S = 0.25
-ROLES: dict[str, type[Calibrating] | type[Checking]] = {
-    CALIBRATOR: Calibrating, CHECKER: Checking}
+ROLES: dict[str, type[Calibrating] | type[Checking] | type[Placing]] = {
+    CALIBRATOR: Calibrating, CHECKER: Checking, RIG: Placing}
 
 
 class CameraNode(LifecycleNode):  # type: ignore[misc]
@@ -46,7 +47,7 @@ class CameraNode(LifecycleNode):  # type: ignore[misc]
 
     def __init__(self, program: str, given: Mapping[str, Any],
                  required: frozenset[str] = frozenset()) -> None:
-        """program: CALIBRATOR or CHECKER. given: the parameters that were given at the start.
+        """program: of PROGRAMS. given: the parameters that were given at the start.
 
         required: names of those that must be known; others of given that are not are for other
         nodes. Raises ConfigError for wrong parameters.
@@ -56,7 +57,7 @@ class CameraNode(LifecycleNode):  # type: ignore[misc]
             self._program, self._given, self._required = program, given, required
             self._log = Log(self)
             self.complaints = Complaints(self._log.warning)
-            self.role: Calibrating | Checking | None = None
+            self.role: Calibrating | Checking | Placing | None = None
             self._endpoints: Endpoints | None = None
             # why it could not be configured
             self._failure: Exception | None = None
@@ -114,13 +115,13 @@ class CameraNode(LifecycleNode):  # type: ignore[misc]
         assert self.role is not None and self._endpoints is not None
         result = super().on_activate(state)
         self._endpoints.activate()
-        self.role.drive.images.start()
+        self.role.inputs.start()
         return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop listening; turns and calibration stay."""
         assert self.role is not None
-        self.role.drive.images.stop()
+        self.role.inputs.stop()
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -145,7 +146,7 @@ class CameraNode(LifecycleNode):  # type: ignore[misc]
         check_camera_name(name)
         self.role = ROLES[self._program](endpoints, self.settings, name)
         # all parameters are declared now, those of qos_overrides too
-        known = self.role.drive.images.override_names
+        known = self.role.inputs.override_names
         if text := unknown_text(self, self._program, self._required - known):
             raise ConfigError('E-PARAMETER-UNKNOWN', text)
         if text := unknown_text(self, self._program, self._given.keys() - known):
@@ -161,7 +162,7 @@ class CameraNode(LifecycleNode):  # type: ignore[misc]
 
     def _look(self) -> None:
         if self.role is not None:
-            self.role.drive.images.look()
+            self.role.inputs.look()
 
     def survive(self, error: Exception) -> None:
         """Log and count what a callback raised."""

@@ -16,7 +16,14 @@ import yaml
 from dashcalib_ros.config import RENAMED, Config, _check, describe, expert, setting
 from dashcalib_ros.errors import ConfigError, InputError
 from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
-from dashcalib_ros.ros.interface import CALIBRATOR, CHECKER, PUBLISHED, SERVICES, SUBSCRIBED
+from dashcalib_ros.ros.interface import (
+    CALIBRATOR,
+    CHECKER,
+    PUBLISHED,
+    RIG,
+    SERVICES,
+    SUBSCRIBED,
+)
 
 # an array of integers; the core has it as a text
 LIST = 'mask.segmentation_classes'
@@ -26,6 +33,10 @@ CHANGEABLE = ('commit', 'publish_stale', 'turns.wanted')
 CALIBRATOR_ONLY = frozenset((
     'camera_info_url', 'commit', 'commit_timeout', 'publish_stale', 'contradictions',
     'base_frame', 'publish_tf', 'camera_frame', 'mount_x', 'mount_y', 'mount_z'))
+# that only a rig has; what else it has of the node's own, and of the core, by how names begin
+RIG_ONLY = frozenset(('cameras', 'stores'))
+OF_RIG = ('cameras', 'stores', 'autostart', 'use_odom', 'model', 'known.', 'rig.', 'intrinsics.',
+          'scene.', 'turns.half_width')
 HELP = """\
 usage: ros2 run dashcalib_ros {program}
            [--ros-args -r FROM:=TO -p NAME:=VALUE --params-file FILE ...]
@@ -36,7 +47,7 @@ usage: ros2 run dashcalib_ros {program}
 options:
   -h, --help     show this help and exit
 
-topics, in the node's namespace (in: remap image_raw; out: reliable):
+topics, in the node's namespace (in: remap {input}; out: reliable):
 {topics}
 
 services (std_srvs/Trigger): {services}
@@ -46,15 +57,21 @@ main parameters (* may be changed while the node runs):
 All {count} parameters: config/calibrator.yaml in the package's share folder.
 
 example:
-  dashcalib-{program} --ros-args -r __ns:=/front \\
-      -r image_raw:=image -p image_transport:=compressed -p turns.wanted:=3
+  dashcalib-{program} --ros-args {example}
 """
+EXAMPLE = """-r __ns:=/front \\
+      -r image_raw:=image -p image_transport:=compressed -p turns.wanted:=3"""
+EXAMPLE_OF_RIG = """-p cameras:='front left rear' \\
+      -p stores:=/data/turns -p use_odom:=true -r odom:=/car/odom"""
 PURPOSES = {
     CALIBRATOR: 'Learns a camera from the turns that the car takes. Nothing is published on '
                 'camera_info until a calibration is accepted; from then on each image has its '
                 'camera_info.',
     CHECKER: 'Checks the calibration that a camera driver publishes on camera_info, with the '
-             'turns that the car takes. It publishes no calibration, saves and changes nothing.'}
+             'turns that the car takes. It publishes no calibration, saves and changes nothing.',
+    RIG: 'Places the cameras of one car against the first one by the turns that their calibrators '
+         'store, publishes static transforms once a rig is accepted, and names a camera that was '
+         'moved since.'}
 # settings of the core that are most often set
 CORE = ('model', 'rectified', 'turns.wanted', 'turns.store', 'motion.rate', 'verdict.max_sigma')
 
@@ -108,6 +125,12 @@ class NodeConfig:
     use_temperature: bool = setting(
         False, 'subscribe temperature (sensor_msgs/Temperature of the camera), which the focal '
                'length may follow')
+    cameras: str = setting(
+        '', "names of the car's cameras, with spaces between them, the base first: the calibrator "
+            'of each has its name for a namespace')
+    stores: str = setting(
+        '~/.ros/dashcalib_turns', "folder in which each camera's calibrator has its turns.store, "
+                                  "which has the camera's name; the rig is kept in rig.json there")
     imu_topic: str = expert('', 'deprecated: set use_imu, and remap imu with -r imu:=TOPIC')
     odom_topic: str = expert('', 'deprecated: set use_odom, and remap odom with -r odom:=TOPIC')
     fix_topic: str = expert('', 'deprecated: set use_fix, and remap fix with -r fix:=TOPIC')
@@ -137,9 +160,10 @@ class Settings:
 
 def specs(program: str = CALIBRATOR) -> dict[str, dataclasses.Field[Any]]:
     """Return a program's settings by name: the node's own, then the core's."""
-    own = {spec.name: spec for spec in dataclasses.fields(NodeConfig)
-           if program == CALIBRATOR or spec.name not in CALIBRATOR_ONLY}
-    return {**own, **dict(describe())}
+    found = {**{spec.name: spec for spec in dataclasses.fields(NodeConfig)}, **dict(describe())}
+    return {name: spec for name, spec in found.items() if (
+        name.startswith(OF_RIG) if program == RIG else name not in RIG_ONLY
+        and (program == CALIBRATOR or name not in CALIBRATOR_ONLY))}
 
 
 def with_changes(core: Config, own: NodeConfig, values: Mapping[str, Any]
@@ -174,7 +198,9 @@ def help_text(program: str) -> str:
     return HELP.format(
         program=program, purpose=textwrap.fill(PURPOSES[program], 80), topics='\n'.join(topics),
         services=', '.join(each.name for each in SERVICES if program in each.programs),
-        parameters='\n'.join(rows), count=len(known))
+        parameters='\n'.join(rows), count=len(known),
+        input='odom' if program == RIG else 'image_raw',
+        example=EXAMPLE_OF_RIG if program == RIG else EXAMPLE)
 
 
 def parse(argv: Sequence[str]) -> tuple[bool, frozenset[str]]:

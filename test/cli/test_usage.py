@@ -19,12 +19,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from fakes import called_like
 from made_calibration import MOUNT, TRUTH, make_calibration
 
 import dashcalib_ros
 from dashcalib_ros.camera import AUTO, calibrated_models
 from dashcalib_ros.camera.field import TERMS as FIELD_TERMS
 from dashcalib_ros.cli import main
+from dashcalib_ros.cli import rig as rig_command
 from dashcalib_ros.cli.arguments import (
     COMMANDS,
     JSON,
@@ -43,6 +45,7 @@ from dashcalib_ros.formats.rig import rig_json
 from dashcalib_ros.report import write_results
 from dashcalib_ros.report.tables import line
 from dashcalib_ros.rig.placed import PlacedCamera, RigCalibration, base_camera
+from dashcalib_ros.rig_session import Rig, open_camera, rig_of_drives
 from dashcalib_ros.workers.worker import THREAD_VARIABLES
 
 HEAVY = ('numpy', 'cv2', 'scipy', 'yaml', 'rich', 'matplotlib', 'pycolmap', 'rosbags', 'rclpy')
@@ -274,6 +277,39 @@ def test_two_rigs_of_one_car(here, tmp_path):
         refused = here('compare', tmp_path / 'a', *args)
         assert_one_line_error(refused)
         assert f'[{code}]' in refused.stderr
+
+
+def test_a_rig_is_asked_for_by_names(here, tmp_path, monkeypatch):
+    for code, *args in (('E-RIG-ARGUMENT', 'front.mp4', 'rear=rear.mp4'),
+                        ('E-RIG-ARGUMENT', 'front=', 'rear=rear.mp4'),
+                        ('E-RIG-NAME-TWICE', 'a=front.mp4', 'a=rear.mp4')):
+        assert_one_line_error(here('rig', *args), code)
+    found = RigCalibration('rear', {name: PlacedCamera(f'{name}/result.json', 'accepted', zero,
+                                                       (0.05, 0.05, 0.05))
+                                    for name, zero in (('front', (0.0, 180.0, 0.0)),
+                                                       ('rear', (0.0, 0.0, 0.0)))})
+    asked, opened = [], {}
+
+    @called_like(rig_of_drives)
+    def solved(drives, base=None, config=None, observer=None, place=None, match=False):
+        asked.append((list(drives), base, match))
+        return Rig(found, {name: make_calibration() for name in drives})
+
+    @called_like(open_camera)
+    def open_one(path, fps=None, motion=None):
+        opened[path] = fps, motion
+
+    monkeypatch.setattr(rig_command, 'rig_of_drives', solved)
+    monkeypatch.setattr(rig_command, 'open_camera', open_one)
+    cameras = ('front=front.mp4', 'rear=d.mcap:/rear')
+    for more, expected in (((), (None, False)), (('--base', 'rear', '--match'), ('rear', True))):
+        done = here('rig', *cameras, '--out', tmp_path / 'rig', '--motion', 'm.csv', *more)
+        assert done.returncode == 0, done.stderr
+        assert asked[-1] == (['front', 'rear'], *expected)
+        # of the first camera's clock, or the base's
+        assert opened == {'front.mp4': (None, None if more else Path('m.csv')),
+                          'd.mcap:/rear': (None, Path('m.csv') if more else None)}
+    assert (tmp_path / 'rig' / 'rig.json').exists()
 
 
 def test_mountings_are_exported(here, results):

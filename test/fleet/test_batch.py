@@ -8,6 +8,7 @@ import io
 import json
 import os
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,11 +18,13 @@ from solving import remembered
 
 from dashcalib_ros.errors import ConfigError, OutputError, coded
 from dashcalib_ros.fleet import fuse, storage
+from dashcalib_ros.fleet import rigs as fleet_rigs
 from dashcalib_ros.fleet.batch import batch, cameras_of, problems, shard_of
 from dashcalib_ros.fleet.clips import GONE
 from dashcalib_ros.fleet.engine import LocalEngine
 from dashcalib_ros.fleet.manifest import Row, read_manifest
 from dashcalib_ros.fleet.tables import camera_folder
+from dashcalib_ros.formats.rig import load_rig
 from dashcalib_ros.store.scene_file import encoded
 from dashcalib_ros.workers.worker import WorkerDiedError
 
@@ -91,7 +94,9 @@ def calibrate(rows, out, worker=None, shard=None, **options):
     """Return the cameras, and the files that tell of all."""
     cameras = cameras_of(rows, shard or (1, 1))
     engine = LocalEngine(3, [worker or Here()])
-    return cameras, batch(cameras, str(out), SETTINGS, engine, shard is None, **options)
+    files, rigs = batch(cameras, str(out), SETTINGS, engine, shard is None, **options)
+    assert rigs == {}
+    return cameras, files
 
 
 def run(manifest, out, worker=None, shard=None):
@@ -376,3 +381,58 @@ def test_names_of_cameras_never_share_a_folder():
     folders = [camera_folder(name) for name in names]
     assert len(set(folders)) == len(names)
     assert all(folder.count('/') == 1 and '..' not in folder for folder in folders)
+
+
+DATE_S = 1.7e9
+
+
+def car(folder, name, first=0, **options):
+    """Write a clip of a camera of one car, from the first of its turns on."""
+    clip = clip_of(yaws=YAWS[first:first + 2], world=first, tracks=150, keyframes=14)
+    rng, turns = np.random.default_rng(len(name)), []
+    for n, turn in enumerate(clip.turns):
+        tracks = turn.scene.tracks
+        turns.append(replace(turn, scene=replace(turn.scene, tracks=replace(
+            tracks, stamps_ns=tracks.stamps_ns + 40_000_000_000 * n,
+            # noise of its own
+            xy=(tracks.xy + 0.1 * rng.normal(size=tracks.xy.shape)).astype(np.float32))),
+            stamp_s=40.0 * n + 1.0))
+    written(replace(clip, turns=tuple(turns), content=f'{len(name):032x}'),
+            folder / f'{name}.npz')
+    return {'clip': f'{name}.npz', 'camera': name, 'rig': 'car 1', **options}
+
+
+def fleet(folder, rows, worker=None):
+    (folder / 'm.jsonl').write_text('\n'.join(map(json.dumps, rows)))
+    cameras = cameras_of(read_manifest(str(folder / 'm.jsonl')))
+    return batch(cameras, str(folder / 'out'), SETTINGS, LocalEngine(3, [worker or Here()]))[1]
+
+
+def test_the_cameras_of_a_car_are_a_rig(tmp_path, monkeypatch):
+    rows = [car(tmp_path, 'front', time=DATE_S), car(tmp_path, 'side', time=DATE_S + 2),
+            # of another day, and of a car with one camera
+            car(tmp_path, 'rear', time=DATE_S + 1e6),
+            {**car(tmp_path, 'front', rig='car 2'), 'camera': 'alone'}]
+    rigs = fleet(tmp_path, rows)
+    # two small turns are few
+    assert rigs['car 1'] == {'front': 'accepted', 'side': 'weak', 'rear': 'refused'}
+    assert 'alone' in rigs['car 2'] and set(rigs) == {'car 1', 'car 2'}
+    folder, = (tmp_path / 'out' / 'rigs').iterdir()
+    found = load_rig(folder)
+    side = found.cameras['side']
+    assert (folder / side.calibration).resolve() == (
+        tmp_path / 'out' / 'cameras' / 'side' / 'result.json')
+    # both are one and the same
+    assert np.all(np.abs(side.rotation_deg) < 3.5 * np.array(side.rotation_sigma_deg))
+    assert max(side.rotation_sigma_deg) < 1.0 and (folder / 'rig.urdf').exists()
+    assert abs(side.time_offset_s - 2.0) < 0.05
+    assert [each.code for each in found.cameras['rear'].reasons] == ['E-RIG-NO-SHARED']
+    # what was solved is not solved again
+    monkeypatch.setattr(fleet_rigs, 'rig_of_scenes', None)
+    assert fleet(tmp_path, rows) == rigs
+
+
+def test_a_rig_of_several_drives_needs_their_dates(tmp_path):
+    rows = [car(tmp_path, 'front'), car(tmp_path, 'side'),
+            {**car(tmp_path, 'more', first=2), 'camera': 'front'}]
+    assert fleet(tmp_path, rows)['car 1'].endswith('[E-RIG-NO-TIMES]')

@@ -32,6 +32,14 @@ def test_a_csv_names_clips_relative_to_itself(tmp_path):
         'cam': 2, '/abs/2.mp4': 1}
 
 
+def test_a_rig_has_the_cameras_of_its_rows(tmp_path):
+    rows = rows_of(tmp_path, 'clip,camera,rig\na.mp4,a,car 1\nb.mp4,b, car 1\nc.mp4,c,\n'
+                             'd.mp4,d,car 1\nd2.mp4,d,car 2\n')
+    # a camera of two cars is of none
+    assert {each.name: each.rig for each in cameras_of(rows)} == {
+        'a': 'car 1', 'b': 'car 1', 'c': '', 'd': ''}
+
+
 def test_what_is_known_of_a_camera_stands_in_its_rows(tmp_path):
     rows = rows_of(tmp_path, 'clip,camera,known\na.mp4,a,stabiliser=no fx=1160+-20\n'
                              'b.mp4,a,"aspect=1; shutter=24 ms"\nc.mp4,a,fx=1160±20\nd.mp4,a\n'

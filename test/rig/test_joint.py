@@ -10,16 +10,21 @@ from made_rig import SPEED, Mounted, made_paths
 
 from dashcalib_ros.camera.rotation import OPTICAL, rotation_matrices, rotation_vectors
 from dashcalib_ros.config import RigConfig
-from dashcalib_ros.rig.joint import Solved, solved
+from dashcalib_ros.rig import joint
+from dashcalib_ros.rig.joint import Matched, Solved, solved
+from dashcalib_ros.rig.moved import changes
 from dashcalib_ros.rig.paths import CameraPaths
 from dashcalib_ros.rig.placed import (
+    Alone,
     PlacedCamera,
     apart_doubts,
     base_camera,
     base_doubts,
+    best_base,
     lens_doubts,
     misnamed,
     placed,
+    rig_of_paths,
     why_not_aligned,
 )
 from dashcalib_ros.rig.start import aligned, problem_of
@@ -167,10 +172,10 @@ def test_a_clip_of_another_drive_does_not_turn_alike():
     other, _ = made_paths({'rear': CAMERAS['rear']}, yaws=(25.0, 30.0, 28.0), seed=3)
     found = aligned(other['rear'], front['front'])
     assert found is None or not found.found
-    assert why_not_aligned('rear', 'front', found, 3).code in (
+    assert why_not_aligned('rear', 'front', found, None).code in (
         'E-RIG-OTHER-DRIVE', 'E-RIG-NO-SHARED')
     assert aligned(CameraPaths('rear', (), np.zeros((0, 0))), front['front']) is None
-    assert why_not_aligned('rear', 'front', None, 0).code == 'E-RIG-NO-SCENES'
+    assert why_not_aligned('rear', 'front', None, 'rear').code == 'E-RIG-NO-SCENES'
 
 
 @pytest.mark.parametrize('late_s', [-12.0, 0.0, 7.31])
@@ -187,4 +192,111 @@ def test_a_turn_to_the_other_side_is_another_drive():
     left, _ = made_paths({'left': CAMERAS['left']}, yaws=(-85.0, 75.0, -60.0))
     found = aligned(left['left'], front['front'])
     assert found is not None and found.other_side and not found.found
-    assert why_not_aligned('left', 'front', found, 3).code == 'E-RIG-OTHER-SIDE'
+    assert why_not_aligned('left', 'front', found, None).code == 'E-RIG-OTHER-SIDE'
+
+
+def of_paths(paths, levels=None, base='front'):
+    """Return the rig of made paths, as a whole; levels: of lenses that are not accepted."""
+    alone = {name: Alone(name, (levels or {}).get(name, 'accepted'), 0.0, len(each.scenes))
+             for name, each in paths.items()}
+    turned = {name: aligned(paths[name], paths[base]) for name in paths if name != base}
+    return rig_of_paths(alone, base, turned, paths, speed, RigConfig())
+
+
+def codes_of(camera):
+    return [reason.code for reason in camera.reasons]
+
+
+def test_a_clip_of_another_car_is_named_and_the_others_stand():
+    paths, _ = made_paths(CAMERAS, yaws=(85.0, -75.0))
+    other, _ = made_paths({'left': CAMERAS['left']}, yaws=(25.0, 60.0, -30.0), seed=3)
+    found = of_paths({**paths, **other})
+    assert found.cameras['rear'].verdict == 'accepted' == found.cameras['front'].verdict
+    assert found.cameras['left'].verdict == 'refused' and found.cameras['left'].rotation is None
+    assert set(codes_of(found.cameras['left'])) <= {
+        'E-RIG-OTHER-DRIVE', 'E-RIG-NO-SHARED', 'E-RIG-OTHER-SIDE'}
+    assert all(str(each).startswith('left') for each in found.cameras['left'].reasons)
+    # of the base, which then agrees with nobody
+    found = of_paths({'left': other['left'], 'front': paths['front']}, base='left')
+    assert found.cameras['front'].rotation is None and not found.accepted
+
+
+def test_a_camera_that_is_refused_gets_its_rotation_and_the_others_stand():
+    paths, _ = made_paths(CAMERAS, yaws=(85.0, -75.0))
+    found = of_paths(paths, {'left': 'refused'})
+    assert found.cameras['rear'].verdict == 'accepted' == found.cameras['front'].verdict
+    left = found.cameras['left']
+    assert left.verdict == 'weak' and codes_of(left) == ['E-RIG-LENS']
+    off = rotation_vectors((left.rotation @ CAMERAS['left'].rotation.T)[None])[0]
+    assert np.all(np.abs(np.degrees(off)) < 3.5 * np.array(left.rotation_sigma_deg))
+    # where nothing of it could be reconstructed, it is said of whom
+    empty = replace(paths['left'], scenes=())
+    found = of_paths({**paths, 'left': empty}, {'left': 'refused'})
+    assert found.cameras['rear'].verdict == 'accepted'
+    assert codes_of(found.cameras['left']) == ['E-RIG-NO-SCENES']
+    found = of_paths({**paths, 'left': empty}, {'left': 'refused'}, base='left')
+    assert [str(each.reasons[0]).split(':')[0] for each in found.cameras.values()] == ['left'] * 3
+    assert 'E-RIG-NO-SCENES' in codes_of(found.cameras['front'])
+
+
+@pytest.mark.parametrize(('one', 'other'), [('front', 'left'), ('left', 'rear')])
+def test_two_cameras_exchanged_in_the_command_are_named(one, other):
+    names = {one: other, other: one}
+    paths, _ = made_paths({name: CAMERAS[names.get(name, name)] for name in CAMERAS},
+                          yaws=(85.0, -75.0))
+    before, _ = made_paths(CAMERAS, yaws=(85.0, -75.0), seed=1)
+    found = changes(of_paths(paths), of_paths(before))
+    assert found.answer == 'wrong' and set(found.exchanged) == {one, other}
+
+
+@pytest.mark.parametrize(('base', 'seed'), [('left', 5), ('rear', 0)])
+def test_lever_arms_are_found_wherever_scenes_have_their_origin(base, seed):
+    paths, _ = made_paths(CAMERAS, yaws=(85.0, -75.0), seed=seed)
+    found, own = of_paths(paths, base=base), CAMERAS[base]
+    for name, camera in found.cameras.items():
+        truth = CAMERAS[name]
+        true = truth.translation_m - truth.rotation @ own.rotation.T @ own.translation_m
+        off = (np.array(camera.translation_m) - true)[[0, 2]]
+        assert camera.verdict == 'accepted' and np.abs(off).max() < 0.06
+
+
+def test_a_rig_that_does_not_settle_is_not_accepted(monkeypatch):
+    paths, _ = made_paths({name: CAMERAS[name] for name in ('front', 'rear')}, yaws=(85.0, -75.0))
+    monkeypatch.setattr(joint, 'STEPS', 8)
+    monkeypatch.setattr(joint, 'SETTLED', 1e-12)
+    found = of_paths(paths)
+    assert not found.accepted and codes_of(found.cameras['rear'])[0] == 'E-RIG-UNSETTLED'
+
+
+def test_matches_are_observations_of_cameras_and_lenses():
+    cameras = {name: CAMERAS[name] for name in ('front', 'left')}
+    paths, _ = made_paths(cameras, yaws=(85.0, -75.0), lens_sigma=0.3)
+    found = {'left': aligned(paths['left'], paths['front'])}
+    problem = problem_of(paths, 'front', found, speed)
+    true, plain = CAMERAS['left'].rotation, solved(problem)
+    noise, nothing = np.radians(0.02), np.zeros((3, 3))
+    sharp = Matched('front', 'left', true, noise**2 * np.eye(3),
+                    {'front': nothing, 'left': nothing})
+    best = solved(replace(problem, matched=(sharp,)))
+    assert np.degrees(best.sigma('left')[:3]).max() < 0.03 < np.degrees(
+        plain.sigma('left')[:3]).max()
+    assert np.abs(np.degrees(errors(best, 'left')[:3])).max() < 0.06
+    # what depends on a lens that is not known says little
+    dull = replace(sharp, follow={'front': nothing, 'left': np.eye(3)})
+    np.testing.assert_allclose(solved(replace(problem, matched=(dull,))).sigma('left')[:3],
+                               plain.sigma('left')[:3], rtol=0.2)
+    # between two cameras of which none is the base
+    paths, _ = made_paths(CAMERAS, yaws=(85.0, -75.0), lens_sigma=0.3)
+    turned = {name: aligned(paths[name], paths['front']) for name in ('left', 'rear')}
+    across = CAMERAS['rear'].rotation @ true.T
+    problem = replace(problem_of(paths, 'front', turned, speed), matched=(replace(
+        sharp, a='left', b='rear', rotation=across, follow={'left': nothing, 'rear': nothing}),))
+    places = solved(problem).problem.places
+    off = rotation_vectors((places['rear'].rotation @ places['left'].rotation.T @ across.T)[None])
+    assert np.abs(np.degrees(off)).max() < 0.06
+
+
+def test_the_base_is_the_first_camera_whose_lens_is_accepted():
+    assert best_base({'front': 'refused', 'left': 'weak', 'rear': 'accepted'}) == 'rear'
+    assert best_base({'front': 'accepted', 'left': 'accepted'}) == 'front'
+    assert best_base({'front': 'refused', 'left': 'weak', 'rear': 'weak'}) == 'left'

@@ -6,32 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from made_rig import METRES, SIGMA
+from made_rig import seen_rig as rig
 from scipy.spatial.transform import Rotation
 
 from dashcalib_ros.errors import Notice
 from dashcalib_ros.rig.moved import changes
-from dashcalib_ros.rig.placed import PlacedCamera, RigCalibration, base_camera, not_placed, three
-
-SIGMA, METRES = (0.06, 0.08, 0.04), (0.02, 0.5, 0.02)
-PLACES = {'left': ((1.0, 70.0, -2.0), (-0.5, 0.2, 1.0)),
-          'right': ((3.0, -75.0, 1.0), (0.6, 0.1, 1.1)),
-          'rear': ((2.0, 177.5, 1.5), (0.3, -0.2, -2.0))}
-
-
-def rig(*names, turned=None, by=(0.0, 1.0, 0.0), metric=True, seed=0):
-    """Return front and others; turned: the camera that sits otherwise, by degrees in its axes."""
-    rng, cameras = np.random.default_rng(seed), {'front': base_camera('front/result.json')}
-    by_base = Rotation.from_rotvec(by if turned == 'front' else (0, 0, 0), degrees=True)
-    for name in names:
-        vector, shift = PLACES[name]
-        own = Rotation.from_rotvec(by if turned == name else (0, 0, 0), degrees=True)
-        noise = Rotation.from_rotvec(np.array(SIGMA) * rng.normal(size=3), degrees=True)
-        turn = noise * own * Rotation.from_rotvec(vector, degrees=True) * by_base.inv()
-        moved = own.apply(shift) + np.array(METRES) * rng.normal(size=3)
-        cameras[name] = PlacedCamera(
-            f'{name}/result.json', 'accepted', three(turn.as_rotvec(degrees=True)), SIGMA,
-            three(moved) if metric else None, METRES if metric else None, 0.0, 0.001)
-    return RigCalibration('front', cameras)
+from dashcalib_ros.rig.placed import RigCalibration, not_placed, three
 
 
 def moved(found):

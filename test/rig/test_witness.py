@@ -6,7 +6,14 @@ import numpy as np
 
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.camera.rotation import rotation_matrices, rotation_vectors
-from dashcalib_ros.rig.witness import fitted, matched, rays_of, residual_over, sees_alike
+from dashcalib_ros.rig.witness import (
+    fitted,
+    matched,
+    rays_of,
+    residual_over,
+    rotation_by_matches,
+    sees_alike,
+)
 
 CAMERA = Radial((800, 450), 520.0, 520.0, 400.0, 225.0, -0.2, 0.05)
 TRUE = rotation_matrices(np.radians([[0.5, -2.0, 1.0]]))[0]
@@ -43,9 +50,28 @@ def test_matches_find_the_rotation_again():
     assert np.abs(off[[0, 2]]).max() < 0.05 and abs(off[1]) < 0.3
 
 
+def test_a_rotation_by_matches_follows_both_lenses():
+    sigmas = [np.array([2.0, 2.0, 1.5, 1.5, 0.01, 0.01, 1e-5])] * 2
+    found = rotation_by_matches(('a', 'b'), (CAMERA, CAMERA), [matches()], (None, None), TRUE,
+                                sigmas)
+    off = rotation_vectors((found.rotation @ TRUE.T)[None])[0]
+    assert np.all(np.abs(off) < 3.5 * np.sqrt(np.diag(found.covariance)))
+    # matches stay where they are, and the lens is taken for another one
+    step = np.array([4.0, 4.0, 0.0, -2.0, 0.0, 0.01, 0.0])
+    other = CAMERA.with_params(CAMERA.params + step[:6])
+    again = rotation_by_matches(('a', 'b'), (CAMERA, other), [matches()], (None, None), TRUE,
+                                sigmas)
+    moved = rotation_vectors((again.rotation @ found.rotation.T)[None])[0]
+    assert np.linalg.norm(moved) > 1e-3
+    np.testing.assert_allclose(found.follow['b'] @ step, moved, atol=0.3 * np.linalg.norm(moved))
+    assert found.follow['a'].shape == (3, 7) and not found.follow['a'][:, 6].any()
+
+
 def test_few_matches_and_dark_pictures_say_nothing():
     rays, _ = rays_of((CAMERA, CAMERA), [tuple(side[:30] for side in matches())])
     assert fitted(rays, TRUE, CAMERA.fx) is None
+    assert rotation_by_matches(('a', 'b'), (CAMERA, CAMERA), [
+        tuple(side[:30] for side in matches())], (None, None), TRUE, [np.ones(6)] * 2) is None
     dark = np.zeros((100, 100), np.uint8)
     assert len(matched(dark, dark)[0]) == 0
 

@@ -31,6 +31,7 @@ from ros_bench import LARGE_IMAGES, QUICK_COMMAND, REPOSITORY, SOON, Bench, Node
 from dashcalib_ros.config import Config
 from dashcalib_ros.ros.interface import (
     CALIBRATOR,
+    OF_CAMERA,
     OF_RCLPY,
     PROGRAMS,
     PUBLISHED,
@@ -39,7 +40,7 @@ from dashcalib_ros.ros.interface import (
     SUBSCRIBED,
 )
 from dashcalib_ros.ros.parameters import declare, declared_names, given_parameters
-from dashcalib_ros.ros.settings import CHANGEABLE, NodeConfig, specs
+from dashcalib_ros.ros.settings import CHANGEABLE, RIG_ONLY, NodeConfig, specs
 
 COLCON = shutil.which('colcon')
 place = importlib.util.spec_from_file_location(
@@ -70,7 +71,8 @@ def test_the_shipped_parameters_are_the_defaults():
     text = (REPOSITORY / 'config' / 'calibrator.yaml').read_text()
     assert text == docs.sample()
     values = yaml.safe_load(text)['/**']['ros__parameters']
-    own = {spec.name: spec.default for spec in dataclasses.fields(NodeConfig)}
+    own = {spec.name: spec.default for spec in dataclasses.fields(NodeConfig)
+           if spec.name not in RIG_ONLY}
     experts = {name for name, spec in specs().items() if spec.metadata['expert']}
     expected = {name: value for name, value in {**CORE, **own}.items() if name not in experts}
     # NaN equals nothing
@@ -292,8 +294,8 @@ def test_the_permissions_are_what_the_nodes_use():
     The video's topics depend on parameters.
     """
     policy = ElementTree.parse(REPOSITORY / 'config' / 'sros2_policy.xml')
-    rest = {'/clock', 'image_raw/compressed'}
     for program in PROGRAMS:
+        rest = {'/clock', *(['image_raw/compressed'] if program in OF_CAMERA else [])}
         profile = policy.find(f".//profile[@node='{program}']")
 
         def allowed(kind, access, profile=profile):
@@ -314,8 +316,9 @@ def test_the_permissions_have_the_form_that_sros2_takes():
     """Its schema: policy 0.2.0, enclaves, profiles, then lists of names with one access each."""
     policy = ElementTree.parse(REPOSITORY / 'config' / 'sros2_policy.xml').getroot()
     assert (policy.tag, policy.attrib) == ('policy', {'version': '0.2.0'})
-    enclave, checker = policy.findall('enclaves/enclave')
-    assert checker.get('path') == '/dashcalib_ros/checker'
+    enclave, *others = policy.findall('enclaves/enclave')
+    assert [each.get('path') for each in others] == [
+        '/dashcalib_ros/checker', '/dashcalib_ros/rig']
     assert [each.tag for each in policy.iter()][:5] == [
         'policy', 'enclaves', 'enclave', 'profiles', 'profile']
     assert enclave.get('path').startswith('/')
@@ -388,7 +391,8 @@ def test_programs_are_where_ros2_run_looks():
         assert done.stdout.startswith(f'usage: ros2 run dashcalib_ros {program}\n')
 
 
-@pytest.mark.parametrize('command', ['dashcalib', 'dashcalib-calibrator', 'dashcalib-checker'])
+@pytest.mark.parametrize('command', ['dashcalib', 'dashcalib-calibrator', 'dashcalib-checker',
+                                     'dashcalib-rig'])
 def test_pip_puts_the_commands_beside_python(command):
     """An old pip without pyproject.toml puts them where setup.cfg tells colcon to."""
     places = [Path(str(each.locate_file('')))

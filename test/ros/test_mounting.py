@@ -9,8 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from builtin_interfaces.msg import Time
-from fakes import stands_in_for
+from fake_endpoints import FakeEndpoints, transforms
 from geometry_msgs.msg import TransformStamped
 from made_calibration import make_calibration
 from nav_msgs.msg import Odometry
@@ -21,11 +20,7 @@ from std_msgs.msg import Header
 
 from dashcalib_ros.input.motion import SensorBuffer
 from dashcalib_ros.judge.calibration import Mount
-from dashcalib_ros.ros import car
 from dashcalib_ros.ros.car import BY_HAND_M, Mounting, differs, link_of, subscribe_sensors
-from dashcalib_ros.ros.diagnostics import Complaints
-from dashcalib_ros.ros.endpoints import Endpoints, message_class
-from dashcalib_ros.ros.interface import PUBLISHED
 from dashcalib_ros.ros.settings import NodeConfig
 from dashcalib_ros.ros.store import CameraIdentity, StoredCalibration
 
@@ -34,44 +29,6 @@ MOUNT = Mount('accepted', (), 2.0, -1.0, None, None, SIGMA, (600.0, 170.0), 0.5,
 HIGH = replace(MOUNT, height_m=1.4, sigma={**SIGMA, 'height_m': 0.03})
 PLACE = {'mount_x': 1.5, 'mount_y': 0.0, 'mount_z': 1.2}
 IDENTITY = CameraIdentity('dashcam', '/image_raw')
-
-
-@stands_in_for(Endpoints)
-class FakeEndpoints:
-    """Keeps what is published, and the callbacks of subscriptions and timers."""
-
-    def __init__(self, node, log, complaints, given):
-        self.published, self.heard, self.lines, self.ends = [], {}, [], []
-        self.complaints = Complaints(self.lines.append)
-        self.log = SimpleNamespace(warning=self.lines.append, info=self.lines.append)
-        self.node = SimpleNamespace(
-            get_clock=lambda: SimpleNamespace(now=lambda: SimpleNamespace(to_msg=Time)))
-
-    def latched(self, name):
-        message_class(PUBLISHED[name].type)
-        return lambda message: self.published.append((name, message))
-
-    def subscription(self, name, callback, topic=''):
-        self.heard[topic or name] = callback
-
-    def timer(self, period_s, callback):
-        pass
-
-    def at_end(self, function, *arguments):
-        self.ends.append(function)
-
-
-@pytest.fixture
-def tf2(monkeypatch):
-    """Stand in for tf2_msgs, which is not on the package index."""
-    monkeypatch.setitem(sys.modules, 'tf2_msgs', SimpleNamespace())
-    monkeypatch.setitem(sys.modules, 'tf2_msgs.msg', SimpleNamespace(TFMessage=SimpleNamespace))
-    monkeypatch.setattr(car, 'LISTEN_S', 0.0)
-
-
-def transforms(endpoints):
-    """Return what was sent, each as a list of transforms."""
-    return [message.transforms for topic, message in endpoints.published if topic == '/tf_static']
 
 
 def made(publish_tf=True, **settings):
