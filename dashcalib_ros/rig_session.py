@@ -337,10 +337,9 @@ def _speed(speed: Samples, offset: float) -> Metres:
 # for Python ---------------------------------------------------------------------------------
 
 
-def calibrate_rig(drives: Mapping[str, Paths | Recording], base: str | None = None,
-                  fps: float | None = None, config: Settings = None,
-                  motion: MotionOrPath = None, progress: Progress | None = None,
-                  match: bool = False) -> Rig:
+def calibrate_rig(drives: Mapping[str, Paths | Recording], *, base: str | None = None,
+                  fps: float | None = None, motion: MotionOrPath = None, match: bool = False,
+                  config: Settings = None, progress: Progress | None = None) -> Rig:
     """Calibrate several cameras of one car from one drive, and where each sits.
 
     drives: by the cameras' names: a bag, a video, a folder of images, or several files of one
