@@ -26,8 +26,9 @@ from dashcalib_ros.ros.settings import Settings
 from dashcalib_ros.ros.state import Judgement, judge, outcome_text, sigma_text
 from dashcalib_ros.ros.store import CameraIdentity, Store, StoredCalibration, camera_info_path
 
-# s; an older temperature says nothing of now; px of fx, by which camera_info follows it
-OLD_S, LEAST_PX = 60.0, 0.01
+# s; an older temperature says nothing of now. px of fx by which camera_info follows it at the
+# least: what rectifies images makes its maps anew each time
+OLD_S, LEAST_PX = 60.0, 0.1
 
 
 class Calibrating:
