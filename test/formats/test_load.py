@@ -172,7 +172,7 @@ def gyroflow(d, **changes):
 def test_a_file_of_another_program(tmp_path, content, name, wanted):
     path = tmp_path / 'calibration.txt'
     path.write_text(content if isinstance(content, str) else json.dumps(content))
-    read = load_camera(path, name)
+    read = load_camera(path, name=name)
     assert read.camera == type(wanted)(*[
         wanted.image_size, *(pytest.approx(value, rel=1e-12) for value in wanted.params)])
     if name is not None:  # FILE:NAME says the same
@@ -411,7 +411,7 @@ def test_the_sections_of_an_ini_file_are_cameras(tmp_path):
     assert raised.value.code == 'E-CAMERA-CHOICE' and 'STEREO' not in str(raised.value)
     assert load_camera(f'{path}:LEFT_CAM_HD').camera == WANTED
     with pytest.raises(InputError) as raised:
-        load_camera(path, 'RIGHT_CAM_HD')
+        load_camera(path, name='RIGHT_CAM_HD')
     assert raised.value.code == 'E-CALIBRATION-NO-SIZE'
 
 
@@ -706,9 +706,9 @@ def test_camera_info_beside_a_bag_s_pictures(tmp_path, model):
     read = load_camera(path)
     assert read.camera == lens and read.name == f'{path}:/front/camera_info'
     for name in ('/front/image_raw', '/front/camera_info', 'front/image_raw'):
-        assert load_camera(path, name) == load_camera(f'{path}:{name}') == read
+        assert load_camera(path, name=name) == load_camera(f'{path}:{name}') == read
     assert load_camera(next(path.glob('*.mcap'))).camera == lens
-    assert load_camera(path, '/depth/camera_info').camera == TRUTH
+    assert load_camera(path, name='/depth/camera_info').camera == TRUTH
 
 
 def test_camera_info_of_ros_1(tmp_path):

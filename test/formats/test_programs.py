@@ -388,7 +388,7 @@ def test_a_file_as_it_is_published(text, name, size, wanted, tmp_path):
     path.write_text(text)
     if size is not None:
         with pytest.raises(InputError) as raised:
-            load_camera(path, name)
+            load_camera(path, name=name)
         assert raised.value.code == 'E-CALIBRATION-NO-SIZE'
     found = load_camera(path if name is None else f'{path}:{name}', image_size=size).camera
     np.testing.assert_allclose(found.params, wanted.params[:len(found.params)], rtol=1e-12)
@@ -400,9 +400,9 @@ def test_nuscenes_channels_are_beside_the_cameras(tmp_path):
     path.write_text(json.dumps(NUSCENES))
     (tmp_path / 'sensor.json').write_text(json.dumps([
         {'token': 's1', 'channel': 'LIDAR_TOP'}, {'token': 's2', 'channel': 'CAM_FRONT'}]))
-    assert load_camera(path, 'CAM_FRONT/1', (1600, 900)).camera == FRONT
+    assert load_camera(path, name='CAM_FRONT/1', image_size=(1600, 900)).camera == FRONT
     path.write_text(json.dumps(NUSCENES[:2]))
-    assert load_camera(path, 'CAM_FRONT', (1600, 900)).camera == FRONT
+    assert load_camera(path, name='CAM_FRONT', image_size=(1600, 900)).camera == FRONT
 
 
 def test_tables_of_argoverse_2_and_waymo(tmp_path):

@@ -199,7 +199,7 @@ def test_a_resized_calibration_is_recognised(solution):
     assert '1600x900' in found.reasons[0]
     assert 'dashcalib export CALIBRATION --to ros --size 800x450 --out ' in found.reasons[0]
     name = "my cam's.yaml"
-    named = check(LENS.resized(2.0, (1600, 900)), SIZE, solution, ACCEPTED, CONFIG, name)
+    named = check(LENS.resized(2.0, (1600, 900)), SIZE, solution, ACCEPTED, CONFIG, name=name)
     command = shlex.split(named.reasons[0].partition('px): ')[2])
     assert command[:6] == ['dashcalib', 'export', name, '--to', 'ros', '--size']
     small = LENS.resized(0.5, (400, 225))
