@@ -331,6 +331,8 @@ FIGURES = (
     Figure(LIMITS, 'off by # px in the median and # px in 95 % (@)', 'population', RAYS),
     Figure(LIMITS, 'readouts are # % off in the median, and the truth within 2 sigma # of # times '
            '(@)', 'population', READOUTS),
+    Figure(LIMITS, 'of those accepted it was up to # of its sigma off (@)', 'population', (
+        found(r'\| accepted \| cy \|.* ([\d.]+) \|'),)),
     Figure(LIMITS, 'roll is #° off, with a sigma of #° (@)', 'mount', (roll,)),
     Figure(LIMITS, 'fx is # % and fy # % off, at 1242×375 # and # % (@', 'accuracy', tuple(
         cell(name, column) for name in ('kitti03, a third', 'kitti03')
