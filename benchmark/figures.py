@@ -252,7 +252,7 @@ CLOCKS = (found(r'or not found: (\d+) of (\d+)'),)
 FIGURES = (
     Figure(README, '# of # sound lenses and # of # behind glass accepted, # wrong; # % of the '
            'parameters within 1 sigma, # % within 2 | @ |', 'population', POPULATION),
-    Figure(README, '| # of # (KITTI 03), # of # (KITTI 07), # of # (ntu_campus, weak). They share '
+    Figure(README, '| # of # (KITTI 03), # of # (KITTI 07), # of # (ntu_campus). They share '
            'turns | @ |', 'real', tuple(found(rf'\| {name} \|.*?\| (\d+) of (\d+) \|')
                                         for name in ('kitti03', 'kitti07', 'ntu_campus'))),
     Figure(README, '| fx # and # px; true rotation says # and # px | @ |', 'real', (
@@ -282,7 +282,7 @@ FIGURES = (
         for source in fx_of(column, name))),
     Figure(PROOF, '| fx # px, the chessboard # | @ |', 'real', (
         *fx_of('fx, px', 'kitti_raw'), *fx_of('judged by', 'kitti_raw'))),
-    Figure(PROOF, '| weak: fx # px, the closed loop # | @ |', 'real', (
+    Figure(PROOF, '| fx # px, the closed loop # | @ |', 'real', (
         *fx_of('fx, px', 'ntu_campus'), *fx_of('judged by', 'ntu_campus'))),
     Figure(PROOF, '| # % and # % | @ |', 'real', (
         cell('kitti03', 'scale drift %: shipped K'), cell('kitti03', 'ours'))),
