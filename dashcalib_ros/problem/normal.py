@@ -28,7 +28,7 @@ LEAST_VARIANCE = 1e-6
 # of damped steps: the least and the greatest diagonal, as Ceres has them
 LEAST, GREATEST = 1e-6, 1e32
 # of the noise: by how far all tracks drift alike from their first image to their last, for each
-# of the smooth patterns over the picture. Of 15 rendered drives: 0.015 px where the noise
+# of the smooth patterns over the picture. Of 16 rendered drives: 0.015 px where the noise
 # is 0.054 px (benchmark/results/exact.md)
 COMMON_DRIFT = 0.28
 
