@@ -265,7 +265,7 @@ FIGURES = (
     Figure(README, '| # of # shifts not within 2 sigma | @ |', 'clocks', CLOCKS),
     Figure(README, '| # of # images answered, # ms in the median, # % of a core | @ |',
            'node_latency', NODE),
-    Figure(README, 'KITTI 03 had fx # px live and # px by command and Python (@)', 'node_drive', (
+    Figure(PROOF, '| fx # and # px | @ |', 'node_drive', (
         found(r'fx (\d+\.\d ± \d+\.\d) px', r'(?s)KITTI 03.*?\| fx \| (\d+\.\d)'),
         found(r'with other turns: (\d+\.\d ± \d+\.\d)', r'(?s)KITTI 03.*?reference (\d+\.\d)'))),
     Figure(PROOF, '| # of #, # of #; #; # and # % | @ |', 'population', POPULATION),
