@@ -90,7 +90,7 @@ class Calibrator(AbstractContextManager['Calibrator']):
             self.workers.wait(lambda: len(self.workers.unbuilt()) <= self._workers + 1)
         return self.status()
 
-    def sense(self, motion: SensorStream, warmth: SensorStream | None = None) -> None:
+    def sense(self, motion: SensorStream | None, warmth: SensorStream | None = None) -> None:
         """Take what the car's sensors say of the drive so far, in the place of what came before.
 
         Stamps count from the first image. warmth: has the temperature, where motion has not.

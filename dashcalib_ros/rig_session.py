@@ -138,7 +138,8 @@ def rig_of_drives(drives: Mapping[str, Recording], base: str | None = None,
                          len(found[name].scenes)) for name, each in learned.items()}
     mount = learned[base].calibration.mount
     return Rig(rig_of_paths(alone, base, turned, paths, _metres(learned, again.late), config.rig,
-                            lambda best: _witnessed(learned, best, matches, match),
+                            lambda best, use: _witnessed(learned, best, matches,
+                                                         match and use),
                             None if mount is None else mount.rotation),
                {name: each.calibration for name, each in learned.items()})
 

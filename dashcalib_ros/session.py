@@ -205,9 +205,7 @@ def learned_drive(drive: Recording, config: Config | None, observer: Observer, v
     """Give a calibrator that has taken every frame and what the sensors say."""
     calibrator = Calibrator(config, drive.mask, verbose)
     try:
-        streams = [each for each in (drive.motion, drive.warmth) if each is not None]
-        if streams:
-            calibrator.sense(*streams)
+        calibrator.sense(drive.motion, drive.warmth)
         _feed(calibrator, drive, observer)
         yield calibrator
     finally:

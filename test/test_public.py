@@ -132,7 +132,7 @@ class FakeCalibrator:
         self.workers = types.SimpleNamespace(run=self._run)
         self.scenes, self.solution = types.SimpleNamespace(reconstructed=list), None
 
-    def sense(self, motion):
+    def sense(self, motion, warmth=None):
         type(self).motion = motion
 
     def push(self, frame):

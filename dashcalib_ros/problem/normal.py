@@ -424,9 +424,9 @@ def common_drifts(observed: Observed) -> Floats:
     """Return (6, n) how far observations are off where all tracks drift alike, in units of it.
 
     Each track drifts by one from its first observation to its last, times a polynomial of the
-    second degree over the picture. What a corner looks like decides where it drifts, and all of a
-    street look alike. Thousands of tracks do not average that out, and the height of the centre
-    hangs on it: cy was 4.7 sigma off without (docs/lessons.md).
+    second degree over the picture. Thousands of tracks do not average such a drift out, and it
+    moves the principal point: without it in sigma, cy was up to 4.7 sigma off. Its cause is not
+    known (docs/lessons.md).
     """
     seconds = observed.stamps_ns / 1e9
     begin, end = np.full((2, len(observed.tracks)), [[np.inf], [-np.inf]])

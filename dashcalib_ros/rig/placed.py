@@ -130,11 +130,12 @@ def best_base(levels: Mapping[str, Level]) -> str:
 
 def rig_of_paths(alone: Mapping[str, Alone], base: str, turned: Mapping[str, Aligned | None],
                  paths: Mapping[str, CameraPaths], metres: Metres | None, limits: RigConfig,
-                 witnessed: Callable[[Solved], Witnessed] = lambda best: Witnessed(),
+                 witnessed: Callable[[Solved, bool], Witnessed] = lambda best, use: Witnessed(),
                  car: Floats | None = None) -> RigCalibration:
     """Return where the cameras of one car sit.
 
-    turned: of each but the base, how its turning fits to the base's. metres: None: unknown. car:
+    turned: of each but the base, how its turning fits to the base's. metres: None: unknown.
+    witnessed: what cameras see together, and with which rotations if they are to be used. car:
     (3, 3) from the base's optical axes to the car's; None: unknown.
     """
     there = {name for name, each in paths.items() if each.scenes}
@@ -145,10 +146,10 @@ def rig_of_paths(alone: Mapping[str, Alone], base: str, turned: Mapping[str, Ali
     doubts = {name: lens_doubts(name, each.level) for name, each in alone.items()}
     seen = Witnessed()
     if problem is not None and best is not None:
-        seen = witnessed(best)
+        seen = witnessed(best, True)
         if seen.matched:
             best = solved(replace(problem, matched=seen.matched))
-            seen = replace(seen, epipolar=witnessed(best).epipolar)
+            seen = replace(seen, epipolar=witnessed(best, False).epipolar)
         doubts = {name: (*each, *(apart_doubts(name, best) if name in best.problem.lenses else ()),
                          *unsettled_doubts(name, best), *seen.doubts.get(name, ()))
                   for name, each in doubts.items()}

@@ -327,12 +327,12 @@ class ImageInput:
                     'or this computer is overloaded; check the rate of the driver and the load')
         infos = self._node.get_publishers_info_by_topic(self.topic)
         remedies = ['set reliability to auto' if infos and all(map(_reliable, infos)) else
-                 'let the driver publish reliable images']
+                    'let the driver publish reliable images']
         if self._kind == IMAGE:
             remedies.append('publish compressed images')
             if get_rmw_implementation_identifier().startswith('rmw_fastrtps'):
                 remedies.append("start the driver's process with config/fastdds_large_images.xml "
-                             '(this node cannot see whether it already does)')
+                                '(this node cannot see whether it already does)')
         return ('either the camera driver skips images: check its rate; or the best-effort '
                 f'transport loses them: {", or ".join(remedies)}')
 

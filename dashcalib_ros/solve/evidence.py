@@ -109,7 +109,7 @@ def costs_left_out(now: Estimate, loss_px: float) -> dict[TurnId, float]:
     loss_px: of the Cauchy loss. With one turn only, its cost with its own camera.
     """
     unit = now.noise(loss_px).variance * now.inflation
-    turns = costs_of(now, loss_px)
+    turns = [normal_equations(each, unit).cost.at_noise(unit) for each in now.linear(loss_px)]
     total = Quadratic.together([*turns, now.imaging.prior()])
     limit_px, found = now.config.scene.error_px, {}
     for scene, turn in zip(now.seen_by_lens, turns, strict=True):
