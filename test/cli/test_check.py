@@ -43,6 +43,9 @@ class FakeCalibrator:
         self.scenes = SimpleNamespace(reconstructed=list)
         self.solution = SimpleNamespace()
 
+    def sense(self, motion, warmth=None):
+        pass
+
     def push(self, frame):
         pass
 

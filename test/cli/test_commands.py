@@ -63,6 +63,9 @@ class FakeCalibrator:
         self.frames, self.closed = 0, False
         self.made.append(self)
 
+    def sense(self, motion, warmth=None):
+        pass
+
     def push(self, frame):
         self.frames += 1
         return Status(frames=self.frames, turns=self.frames // 2, built=0, yaw_deg=0.0,
