@@ -8,6 +8,7 @@ import signal
 import sys
 import threading
 import traceback
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
@@ -31,6 +32,7 @@ def command() -> NoReturn:
     """Run main() as a process of its own, the installed command."""
     if VERBOSE[0] not in sys.argv:
         own_stderr()
+    warnings.showwarning = _show_warning
     try:
         code = main()
     except Exception as error:
@@ -43,6 +45,10 @@ def command() -> NoReturn:
         # Ctrl-C in the middle of a lock's own code leaves it locked: no thread is waited for
         os._exit(code)
     sys.exit(code)
+
+
+def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
+    write_stderr(f'{PROGRAM}: warning: {message}')
 
 
 def main(argv: Sequence[str] | None = None) -> int:

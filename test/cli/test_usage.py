@@ -169,6 +169,13 @@ def test_documents_name_every_kind_of_export(kind):
     assert f'`{kind}`' in exports
 
 
+def test_an_earlier_name_of_a_setting_is_a_warning_of_one_line():
+    done = dashcalib('turns', 'nothing', '--set', 'threads=1')
+    assert done.stderr.splitlines()[0] == (
+        'dashcalib: warning: the setting threads is called workers now'), done.stderr
+    assert done.stderr.count('\n') == 2
+
+
 def test_help_imports_nothing_heavy():
     code = ('import sys; from dashcalib_ros.cli import main; before = main(["run", "--help"]); '
             f'print(before, [name for name in {HEAVY} if name in sys.modules])')
