@@ -97,12 +97,12 @@ SPOILT: dict[str, Callable[[Film, np.random.Generator], Film]] = {
 
 
 def row_of(found: CalibrationData, fx: float, fx_sigma: float) -> dict[str, Any]:
-    """Return what is kept of a result."""
+    """Return what is kept of a result; fx: the truth, NaN for a model that cannot have one."""
     yaws = [turn.yaw_deg for turn in found.turns if turn.yaw_deg is not None]
     sigma = float((found.sigma or {}).get('fx', np.nan))
     row = {'verdict': found.verdict.level, 'yaw': max(yaws, default=0.0), 'scenes': len(yaws),
            'fx': None, 'sigma': None, 'percent': None, 'sigmas': None}
-    if found.camera is None or not np.isfinite(sigma):
+    if found.camera is None or not np.isfinite([sigma, fx]).all():
         return row
     off = found.camera.fx - fx
     return {**row, 'fx': found.camera.fx, 'sigma': sigma, 'percent': 100 * off / fx,

@@ -80,10 +80,8 @@ DRIFT_ROUNDS = 3
 # nats of evidence that earlier drives had another camera: three standard deviations
 CONTRADICTION = 4.5
 # of fx: what gentle bends and straight stretches have in common beyond the errors of their tracks,
-# with fixed pictures; and where pictures may be shifted, with a bend of 20 degrees. The less a bend
-# turns, the more of it a shift makes up for: of 16 real pieces of 10 s (KITTI 03, raw), those of 15
-# to 20 degrees are off by 2.6 % RMS, those of 7 to 13 degrees by 6.8 %
-# (benchmark/results/without_turns.md)
+# with fixed pictures; and where pictures may be shifted, with a bend of 20 degrees. The less a
+# bend turns, the more of it a shift makes up for (benchmark/results/without_turns.md)
 GENTLE, GENTLE_SHIFTED = 0.008, 0.03
 # degrees: no stretch counts as straighter
 LEAST_BEND_DEG = 1.0
@@ -363,7 +361,8 @@ def _posterior(found: Estimate) -> Posterior:
     if sharpest >= HIDDEN_DEG:
         return known
     return known.erring_together(
-        GENTLE_SHIFTED * HIDDEN_DEG / max(sharpest, LEAST_BEND_DEG) if found.moves else GENTLE)
+        GENTLE_SHIFTED * np.sqrt(HIDDEN_DEG / max(sharpest, LEAST_BEND_DEG)) if found.moves
+        else GENTLE)
 
 
 def _solution(found: Estimate, unlike: Mapping[TurnId, float], coarse: Profile,
