@@ -35,7 +35,7 @@ from dashcalib_ros.judge import CalibrationData
 
 # input, images per second of folders, and the truth of fx with its sigma, px
 DRIVES = {'kitti03': ('bag', None, 718.2, 1.8), 'kitti07': ('images', 9.65, 701.9, 1.4),
-          'kitti_raw': ('images', 9.7, 981.5, 3.0)}
+          'kitti_raw': ('images', 9.7, 981.5, 3.0), 'carnd': ('drive.mp4', None, 1161.0, 10.0)}
 # degrees
 SHARP = 20.0
 DURATION_S = (10.0, 40.0)
