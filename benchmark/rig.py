@@ -5,7 +5,8 @@
                             [--real FOLDER] [--results]
 
 Rendered rigs have exact truth; of the real pair (FOLDER has left/ and right/) the epipolar
-geometry of matches that nothing was fitted to is the witness.
+geometry of matches that nothing was fitted to is the witness. Rows go to rig.json in --out;
+what is there is not run again.
 """
 from __future__ import annotations
 
@@ -15,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from measure import parser_with
+from measure import load, parser_with, save
 from result_tables import keep_table
 
 from dashcalib_ros.camera.rotation import rotation_vectors
@@ -92,10 +93,20 @@ def main() -> None:
     parser.add_argument('--cache', type=Path, default=Path(tempfile.gettempdir()) / 'rigs')
     parser.add_argument('--real', type=Path)
     args = parser.parse_args()
-    rows = [row for kind in args.kinds for seed in args.seeds
-            for row in rendered(kind, seed, args.turns, args.cache)]
-    lines = [] if args.real is None else real(args.real)
-    keep_table('rig', '\n'.join([HEAD, *rows, *lines]), args)
+    path = args.out / 'rig.json'
+    done: dict[str, list[str]] = load(path)
+    for kind in args.kinds:
+        for seed in args.seeds:
+            if (key := f'{kind}-{seed}-{args.turns}') not in done:
+                done[key] = rendered(kind, seed, args.turns, args.cache)
+                save(path, done)
+                print('\n'.join(done[key]), flush=True)
+    if args.real is not None and args.real.name not in done:
+        done[args.real.name] = real(args.real)
+        save(path, done)
+    rendered_rows = [row for key, rows in done.items() for row in rows if row.startswith('|')]
+    real_lines = [row for rows in done.values() for row in rows if not row.startswith('|')]
+    keep_table('rig', '\n'.join([HEAD, *rendered_rows, *real_lines]), args)
 
 
 if __name__ == '__main__':
