@@ -54,7 +54,7 @@ def spared(what: str, lost: list[Notice], make: Callable[..., T], *arguments: ob
 
 
 class Notice(str):
-    """A warning, or another line for the user that is no error, with a code as errors have it.
+    """A warning, or another line for the user that is not an error, with a code as errors have it.
 
     It is a string, 'what: remedy', for people. The code is for scripts, and stays when the text
     is reworded.

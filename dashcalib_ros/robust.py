@@ -106,7 +106,7 @@ class Mean:
 
 
 def weighted_mean(values: Floats, variances: Floats) -> Mean:
-    """Return the mean of values (n,) of which each has a variance (n,)."""
+    """Return the mean of values (n,) with variances (n,)."""
     weights = 1 / variances
     mean = float(weights @ values / weights.sum())
     return Mean(mean, 1 / float(weights.sum()), float(weights @ (values - mean)**2), len(values))

@@ -46,7 +46,7 @@ def own_stderr() -> None:
 
 
 def write_stdout(text: str, styled: bool = False) -> None:
-    """Print text and a newline. It is no error if the reader has ended (head, less).
+    """Print text and a newline. It is not an error if the reader has ended (head, less).
 
     styled: it has a terminal's colours, and its texts are visible() already. Raises OutputError
     when stdout is closed or full.

@@ -3,7 +3,7 @@
 
 Parameters of a camera, and all the more of two models, may differ much and map rays alike. What
 counts is the distance in the picture, after the best common rotation of the rays: a rotation of
-the camera cannot be told from one of its mounting (Hagemann et al.).
+the camera cannot be distinguished from one of its mounting (Hagemann et al.).
 """
 from __future__ import annotations
 

@@ -218,7 +218,7 @@ class Drive:
 
 
 def render(lens: Lens, spec: DriveSpec, processes: int = 1) -> Iterator[Frame]:
-    """Yield all frames of a drive, rendered as they are asked for."""
+    """Yield all frames of a drive, rendered on demand."""
     return Drive(lens, spec).frames(processes=processes)
 
 

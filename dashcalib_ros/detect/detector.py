@@ -148,8 +148,8 @@ class TurnDetector:
     def _find(self, stamp_ns: int, value: float) -> None:
         """Take the next sample; the peak that it ends is a candidate unless a higher one is near.
 
-        That one is no turn itself where a still higher one follows near it. But then this peak
-        lies between both, and is no turn either.
+        That one is not a turn itself where a still higher one follows near it. But then this peak
+        lies between both, and is not a turn either.
         """
         peak = self._peaks.push(stamp_ns, value)
         if peak is None:

@@ -202,8 +202,8 @@ def _off(at: Floats, to_between: Floats, to_after: Floats, half: float) -> Float
 # px: least width and height of half an image, side of a patch, how far apart the rows may be; of
 # the width, how far apart the columns may be
 HALF, PATCH, ROWS, COLUMNS = (160, 100), 20, 2, 0.25
-# patches of a half that tell, at the least; correlation of those that are found in the other half,
-# and their share; images that all show it. Of one camera's pictures 0 to 0.54 are found, mostly
+# minimum number of patches of a half that tell; correlation of those found in the other half, and
+# their share; images that all show it. Of one camera's pictures 0 to 0.54 are found, mostly
 # none, of stereo pictures 0.86 to 1
 LEAST_PATCHES, FOUND_AGAIN, LEAST_SHARE, ALL = 12, 0.8, 0.7, 5
 

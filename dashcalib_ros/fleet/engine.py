@@ -56,7 +56,7 @@ class DiedError(WorkerError):
 class Engine(ABC):
     """Runs tasks; outcomes come in any order.
 
-    cpu_s: of the tasks so far, by their function. peak_mb: of memory, of one worker at the most.
+    cpu_s: of the tasks so far, by their function. peak_mb: largest memory of one worker.
     here: the workers see this machine's files.
     """
 
@@ -181,7 +181,7 @@ class LocalEngine(Engine):
 class RayEngine(Engine):
     """A cluster's workers, one thread and one task each; see Engine.
 
-    A task whose node was lost is tried again without being counted: that is no fault of its own.
+    A task whose node was lost is tried again without being counted: that is not its own fault.
     """
 
     here = False

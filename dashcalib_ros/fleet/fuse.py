@@ -42,7 +42,7 @@ class ClipTurn:
     stored: StoredTurn
 
 
-# solutions at the most; each leaves out the clips that contradict the one before
+# maximum number of solutions; each leaves out the clips that contradict the one before
 ROUNDS = 3
 
 

@@ -132,7 +132,7 @@ def clip_rows(camera: str, make: str, clips: Sequence[tuple[Row, ClipResult]],
             share = ClipShare.without(Notice(
                 'E-CLIP-REPEATED', f'is the same clip as in row {first[row.name]}'))
         status, reason, code = _status(result, share)
-        # videos count from 0, which is no date
+        # videos count from 0, which is not a date
         time = next((time for time in (row.time_s, result.time)
                      if time is not None and time > DATES_S), None)
         found.append({
@@ -193,7 +193,7 @@ def drift_of(clips: Sequence[Mapping[str, Any]]) -> FleetDrift | None:
 
     A line through the fx of each clip alone, weighted; sigma grows with the scatter about it.
     Where half of the clips have temperatures, and these differ, those clips count, and what the
-    temperature explains is no drift.
+    temperature explains is not a drift.
     """
     known = [row for row in clips if row['sigma_fx_noise'] and row['time'] is not None]
     warm = [row for row in known if row['temperature_c'] is not None]

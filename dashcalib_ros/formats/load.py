@@ -83,7 +83,7 @@ def load_camera(path: str | os.PathLike[str], *, name: str | None = None,
     Returns a NamedCamera: its `camera` is a Radial, Brown, Rational or Fisheye, in px of the full
     pictures, with the centre of the first pixel at (0, 0). Raises InputError, in one line that
     names the cure, for a file that cannot be read, a lens that none of these describes, and a file
-    with several cameras of which none is named.
+    with several cameras where none is named.
     """
     return load_with_faults(path, name, lambda: image_size, nearest).without_faults()
 
@@ -100,7 +100,7 @@ def load_with_faults(path: str | os.PathLike[str], name: str | None = None,
 
 def load_pair(a: str | os.PathLike[str], b: str | os.PathLike[str]
               ) -> tuple[NamedCamera, NamedCamera]:
-    """Read two cameras of the same pictures, of which one file may omit the pictures' size."""
+    """Read two cameras of the same pictures; one file may omit the pictures' size."""
     found = [_loaded(path, None) for path in (a, b)]
     sizes = [read.image_size for _, read in found if not isinstance(read, Sizeless)]
     first, second = (_checked(label, read, lambda: sizes[0] if sizes else None, False)

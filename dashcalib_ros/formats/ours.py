@@ -380,7 +380,7 @@ def _used_field(data: Any, image_size: tuple[int, int]) -> Field | None:
 
 
 def _readable(read: Callable[[Any], T], data: Any) -> T | None:
-    """Return what a part of a file says; one that is missing, or cannot be read, is no error."""
+    """Return what a part of a file says; None where it is missing or cannot be read."""
     try:
         return read(data)
     except (AttributeError, KeyError, IndexError, TypeError, ValueError, InputError):

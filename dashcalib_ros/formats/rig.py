@@ -97,7 +97,7 @@ def is_rig(path: str | os.PathLike[str]) -> bool:
 def load_rig(path: str | os.PathLike[str]) -> RigCalibration:
     """Read where the cameras of a car sit from path: a rig.json, or its folder.
 
-    Raises InputError for what is no rig.json.
+    Raises InputError for what is not a rig.json.
     """
     place = _place(path)
     return parse_rig(read_text(place, JSON_BYTES), str(place))

@@ -5,7 +5,7 @@ Autoware's and Foxglove's are the same in other words, and are only written here
 
 The YAML is what camera_info_manager, usb_cam, v4l2_camera and others load. Keys, order and layout
 are those that camera_calibration_parsers writes. OpenCV's FileStorage reads the file, too. Version
-4 wants the line %YAML; 4 and 5 want lists that are indented, texts of 4096 characters at the most,
+4 wants the line %YAML; 4 and 5 want lists that are indented, texts of at most 4096 characters,
 and quotes: 4.2.1 is a broken number to them.
 """
 from __future__ import annotations
@@ -42,7 +42,7 @@ from dashcalib_ros.judge.difference import NamedCamera
 CAMERA_NAME = 'dashcam'
 # our own block in the file; the parsers look keys up by name, and so ignore it
 OWN = 'dashcalib'
-# the section of an INI file that is no camera
+# the section of an INI file that is not a camera
 INI_IMAGE = 'image'
 # OpenCV's limit is 4096, and an escaped character has up to ten
 TEXT_LENGTH = 400

@@ -328,7 +328,7 @@ def numbers_in(text: str) -> list[float] | None:
 
 
 def read_sigma(data: Any, camera: Camera) -> dict[str, float] | None:
-    """Return the sigmas where all are known, else None: a missing sigma is no error."""
+    """Return the sigmas where all are known, else None: a missing sigma is not an error."""
     if not isinstance(data, Mapping):
         return None
     try:

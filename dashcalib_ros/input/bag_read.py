@@ -85,7 +85,7 @@ class TooMuchError(apsw.SQLError):
 
 
 def unpack(kind: str, data: bytes, limit: int = CHUNK_BYTES) -> bytes:
-    """Return unpacked data, `limit` bytes and those of a chunk at the most.
+    """Return unpacked data: at most `limit` bytes and those of a chunk.
 
     kind: as bags name it; '' or none: it is not packed. Raises InputError beyond the limit; for
     damage what the libraries raise, and EOFError where it is cut off.

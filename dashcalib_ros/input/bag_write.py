@@ -81,7 +81,7 @@ def check_bag(source: str | os.PathLike[str], image_topic: str | None,
               out: str | os.PathLike[str]) -> None:
     """Check that write_bag() will succeed, before a long calibration and not after it.
 
-    image_topic: None when the source is no bag. Raises InputError or OutputError.
+    image_topic: None when the source is not a bag. Raises InputError or OutputError.
     """
     path = Path(out).absolute()
     _check_free(path)

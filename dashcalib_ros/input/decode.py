@@ -433,7 +433,7 @@ Size = tuple[int, int]
 FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 MARKER = re.compile(rb'\xff[^\xff]')
 BARE = frozenset((0x01, *range(0xD0, 0xD8)))
-# markers before the size of a JPEG, at the most; cameras write 5 to 20
+# maximum number of markers before the size of a JPEG; cameras write 5 to 20
 MARKERS = 1000
 # width, height, tile width and tile height of a TIFF
 TIFF_TAGS = (256, 257, 322, 323)

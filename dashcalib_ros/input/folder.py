@@ -353,7 +353,7 @@ class _Table:
 
     def stamps(self, naming: Sequence[int | None] | None, numbers: Sequence[int | None],
                is_times: bool) -> Sequence[int | None] | None:
-        """Return the times of the images in ns; None where they cannot be told.
+        """Return the times of the images in ns; None where they are not known.
 
         naming: as naming() has it; numbers: in the images' names; is_times: by the list's name.
         """

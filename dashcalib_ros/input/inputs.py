@@ -62,7 +62,7 @@ MAKERS = {maker: re.compile(name, re.IGNORECASE) for maker, name in (
     ('BlackVue names', r'(?P<t>\d{8}_\d{6})(?P<n>)_[A-Z](?P<c>[A-Z])[LS]?'),
     ('Insta360 names', r'(?:PRO_)?VID_(?P<t>\d{8}_\d{6})_(?P<c>\d\d)_(?P<n>\d+)(?:_\d+)?'),
     ('Vantrue names', r'(?P<t>\d{8}_\d{6})_(?P<n>\d+)_(?:[A-Z]_)?(?P<c>[ABC])'))}
-# names of files in a message; of more only the first and the last are told
+# names of files in a message; of more only the first and the last are named
 TOLD = 12
 # missing files for each that is there, where they are numbered one by one
 MOST_MISSING = 3
@@ -120,7 +120,7 @@ def _with_stamps(groups: Sequence[_Group], topic: str | None, fps: float | None,
 
 
 def as_list(path: Paths) -> list[str | os.PathLike[str]]:
-    """Return the paths of a drive. Raises InputError for what is no path."""
+    """Return the paths of a drive. Raises InputError for what is not a path."""
     given = ([path] if isinstance(path, (str, os.PathLike)) else
              list(path) if isinstance(path, Iterable) else [path])
     for each in given:
@@ -370,7 +370,7 @@ def _open_one(place: Path, topic: str | None, fps: float | None) -> FrameSource:
 
 
 def _opener_of(path: Path) -> Callable[[Path, str | None, float | None], FrameSource] | None:
-    """Return what opens a kind of input; a folder with a bag in it is no folder of images."""
+    """Return what opens a kind of input; a folder with a bag in it is not a folder of images."""
     if fits_bag(path):
         from dashcalib_ros.input.bag_storage import BagSource
         return BagSource

@@ -34,9 +34,9 @@ DEGREE_M = 111_320.0
 FARTHEST_M = 1e6
 # degrees of latitude, and of longitude, which some count from 0 on
 FARTHEST_DEG = (90.0, 360.0)
-# values of a stream at the most: ten hours at 200 Hz
+# maximum number of values of a stream: ten hours at 200 Hz
 SAMPLES = 7_200_000
-# samples of a stream at the least; fewer say nothing of a turn
+# minimum number of samples of a stream; fewer say nothing about a turn
 LEAST_SAMPLES = 10
 # share of samples that may be damaged before the stream is not used, or doubled without a word
 DAMAGED = 0.2
@@ -395,7 +395,7 @@ NO_VALUES = np.empty(0), np.empty((0, 3))
 class SensorBuffer:
     """The newest samples of a bag's or a node's sensors: add() them as they come, stream() to ask.
 
-    Doubled and late samples are dropped when they are asked for. Memory is bounded: of each kind
+    Duplicate and late samples are dropped on reading. Memory is bounded: of each kind
     the newest are kept.
     """
 

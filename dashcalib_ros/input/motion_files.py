@@ -73,7 +73,7 @@ LOGS: tuple[tuple[str, Mapping[str, str]], ...] = (
     # MARS logger's gyro_accel.csv
     ('', {STAMP_COLUMN: 'Timestamp[nanosec]',
           **{f'gyro_{axis}': f'g{axis}[rad/s]' for axis in 'xyz'}}))
-# Gyroflow's .gcsv: its first line, lines of its head at the most, columns, and s of a stamp
+# Gyroflow's .gcsv: its first line, maximum number of lines of its head, columns, and s of a stamp
 GCSV, GCSV_LINES, GCSV_TSCALE = 'GYROFLOW IMU LOG', 100, 1e-3
 GCSV_COLUMNS = {STAMP_COLUMN: 't', **{f'gyro_{axis}': f'g{axis}' for axis in 'xyz'}}
 # headings of angular rates in degrees per second, and of speeds in km/h
@@ -231,10 +231,10 @@ def _factor(ours: str, theirs: str, scales: Mapping[str, float]) -> float:
 
 
 def _table(lines: Iterable[str], width: int, places: Sequence[int], mark: str = ',') -> Floats:
-    """Return numbers (n, k) of these places of lines, SAMPLES + 1 lines at the most.
+    """Return numbers (n, k) of these places of at most SAMPLES + 1 lines.
 
-    width: values of a line; mark: between them. NaN for what is no number, and for all of a broken
-    line.
+    width: values of a line; mark: between them. NaN for what is not a number, and for a whole
+    broken line.
     """
     found = array('d')
     for line in islice(filter(str.strip, lines), SAMPLES + 1):

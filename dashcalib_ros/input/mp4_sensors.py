@@ -122,7 +122,7 @@ def camm_streams(path: Path) -> Mapping[str, tuple[Floats, Floats]]:
             elif kind == GPS_SHORT:
                 rows['position'].append((stamp_s, *values))
             elif values[1]:
-                # 0 is no fix
+                # 0 means no fix
                 rows['position'].append((stamp_s, *values[2:5]))
                 rows['speed'].append((stamp_s, float(np.hypot(values[7], values[8]))))
     found = {kind: np.array(each, np.float64) for kind, each in rows.items() if each}

@@ -26,7 +26,7 @@ KEYS = {codec: re.compile(pattern, re.DOTALL) for codec, pattern in {
     'h264': rb'\x00\x00\x01[\x25\x45\x65]', 'hevc': rb'\x00\x00\x01[\x20-\x2b]',
     'av1': rb'\A(?:\x12\x00)?\x0a', 'vp9': rb'\A[\x80-\x83\x90-\x93\xa0-\xa3\xb0\xb1]',
     'vp8': rb'\A...\x9d\x01\x2a'}.items()}
-# pictures that a decoder may hold back at the most
+# maximum number of pictures that a decoder may hold back
 HELD = 64
 THREADS = 2
 

@@ -42,7 +42,7 @@ def least_step_ns(rate: float) -> float:
     return (1 - EARLY) * 1e9 / rate
 
 
-# images whose stamps are compared with the times at which they came, and how many at the least
+# images whose stamps are compared with the times at which they came, and the minimum of them
 COMPARED, LEAST_COMPARED = 50, 8
 # how much longer or shorter the time between stamps is, and what a driver then writes as what
 WRONG_UNITS = {1e-9: 'seconds as nanoseconds', 1e-6: 'milliseconds as nanoseconds',
@@ -104,7 +104,7 @@ class StampGate:
 
     unstamped: times of reception are used. repeated: number of images left out as not later than
     the one before; zero: of those left out as without a stamp. set_back: how often the clock was
-    set back, and furthest_back_ns by how much at the most. lost: images missing between stamps.
+    set back, furthest_back_ns the largest such step. lost: images missing between stamps.
     fault: of the stamps beside the times of reception, in words; from then on those are used.
     """
 

@@ -572,7 +572,7 @@ class CalibrationData:
         """Return an image without distortion, as a camera with the matrix K sees it.
 
         image: (height, width) or (height, width, channels), as cv2.imread() returns it. The field
-        is taken out, too, where one is used. Raises InputError for what is no image or one of
+        is taken out, too, where one is used. Raises InputError for what is not an image or one of
         another size, and where there is no camera.
         """
         camera, image = self._camera, np.asarray(image)

@@ -56,8 +56,8 @@ PATH_S = 0.02
 MADE_S = 0.004
 # s; an offset that is known worse is not named, nor is a drift, of time
 LARGEST_SIGMA_S, LARGEST_DRIFT_SIGMA = 0.05, 2e-4
-# fixes in a turn at the least, as with the five of 1 Hz noise is taken for motion; and s between
-# those that are used
+# minimum number of fixes in a turn (with the five of 1 Hz, noise is taken for motion), and s
+# between those that are used
 LEAST_FIXES, APART_S = 8, 0.06
 # sigmas between a path's offset and that of a gyro with the same stamps
 ALIKE = 2.0

@@ -120,7 +120,7 @@ def evidence_of_detection(detection: Detection, scenes: Iterable[Scene | None] =
 def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> CalibrationData:
     """Return the calibration; a refused one has no intrinsics, so that they cannot be used.
 
-    What is no part of the camera and of its verdict costs only itself where it fails, and a line.
+    What is not part of the camera or its verdict may fail alone: that costs a line.
     """
     lost: list[Notice] = []
     scenes = {turn.scene.turn: turn.scene for turn in evidence.stored} | evidence.built

@@ -300,7 +300,7 @@ class NamedCamera:
 
 
 def difference_between(given: NamedCamera, found: NamedCamera) -> Difference:
-    """Compare two cameras of which there is no more than what their files say."""
+    """Compare two cameras, knowing only what their files say."""
     # in the parameters of one whose covariance is known, so that theirs together has full rank
     base = found if found.covariance is not None else given
     a, b = (each.camera if type(each.camera) is type(base.camera)

@@ -83,8 +83,8 @@ def scale_by_gps(rate: Samples, position: Samples) -> tuple[float, float] | None
 
 # degrees a second, and the seconds over which they are taken; a straight has less
 STRAIGHT_DEG_S, RATE_OVER_S = 2.0, 1.0
-# s and m of a straight at the least; s that are left out at both ends, as clocks differ and
-# receivers filter
+# minimum duration and length of a straight, s and m; s that are left out at both ends, as clocks
+# differ and receivers filter
 STRAIGHT_S, STRAIGHT_M, ENDS_S = 2.0, 20.0, 0.7
 # s between samples of a gyro; over more the angle between them is not known
 LONGEST_GAP_S = 0.35
@@ -112,7 +112,7 @@ def _stretches(stamps_s: Floats, rate: Floats, position: Samples) -> list[_Stret
     return stretches
 
 
-# fixes of a straight at the least: a line through two of them is always exact
+# minimum number of fixes of a straight: a line through two of them is always exact
 FIXES = 3
 # m; fixes of one receiver share errors of this size, which no residual shows
 LEAST_NOISE_M = 0.05
@@ -161,9 +161,9 @@ HEADING_FLOOR_DEG = 0.3
 HEADING_SIGMA_DEG = 5.0
 # degrees a root of a second: noise of cheap gyros
 GYRO_NOISE_DEG = 0.1
-# s between straights at the most; the bias drifts over more
+# maximum time between straights, s; the bias drifts over more
 APART_S = 60.0
-# straights, and degrees between them in all, at the least
+# minimum number of straights, and of degrees between them in all
 LEAST_STRAIGHTS, LEAST_TURNED_DEG = 6, 240.0
 
 

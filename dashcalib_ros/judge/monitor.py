@@ -2,8 +2,8 @@
 """Watches a camera in use, turn by turn: has it been zoomed, cropped, exchanged or moved since.
 
 A single turn may be wrong, by traffic, lost images or a bad reconstruction. So a change is
-suspected after one turn, and told when a second one confirms it. It is taken back only when two
-turns since then speak against it: no state flickers, and none outlives its reason. The newest
+suspected after one turn, and reported when a second one confirms it. It is taken back only when
+two turns since then speak against it: no state flickers, and none outlives its reason. The newest
 turns are compared with those before them, not with the calibration alone: where that one is off
 in all turns alike, nothing has changed.
 """
@@ -132,7 +132,7 @@ def moved_text(than: str, turned_deg: Sequence[float] | Floats) -> str:
             f'{"up" if pitch > 0 else "down"}; its calibration stays right')
 
 
-# times the least sigmas: the error of a camera of which nothing is known
+# times the least sigmas: the error of an unknown camera
 UNKNOWN = 100.0
 # times the zoom that is found, between which the true one is: the linear step overshoots by half
 # and more, and noise adds to it
@@ -144,9 +144,9 @@ UNEXPLAINED_ZOOM = 0.05
 UNEXPLAINED = 0.2
 # by which the turns of one camera vary more than their noise; KITTI 03: up to 5
 SCATTER = 3.0
-# of fx, or of the width: smaller changes are not told
+# of fx, or of the width: smaller changes are not reported
 LEAST_CHANGE = 0.008
-# degrees; a camera that was moved by less is not told
+# degrees; a camera that was moved by less is not reported
 LEAST_TURNED_DEG = 0.6
 # degrees; the direction of travel varies so much between turns, sideways
 HEADING_SIGMA_DEG = 0.15
@@ -313,7 +313,7 @@ class Monitor:
         """Return the fewest parts of the camera that explain the change, in words.
 
         Several texts where other parts explain it as well. Only the sizes of a change of focal
-        length and centre can be told: coefficients of distortion make up for each other.
+        length and centre can be named: coefficients of distortion make up for each other.
         """
         count = len(self.camera.params)
         zoom_and_shift, every = self._zoom_and_shift(), np.eye(count)
@@ -396,7 +396,7 @@ LEAST_DISTORTION_SIGMA = 0.002
 
 
 def _covariance(camera: Camera, sigma: Mapping[str, float]) -> Floats:
-    """Return the (n, n) covariance of a calibration of which at most sigmas are known."""
+    """Return the (n, n) covariance of a calibration where at most sigmas are known."""
     least = np.full(len(camera.params), LEAST_DISTORTION_SIGMA)
     least[:4] = LEAST_SIGMA * camera.fx
     known = [sigma.get(name, 0.0) for name in camera.names()]

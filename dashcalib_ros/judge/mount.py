@@ -282,7 +282,7 @@ def _heading_of_pairs(pairs: _Pairs, kept: Mask, roll: float) -> tuple[Floats, F
         blocks, int(blocks.max()) + 1)
 
 
-# degrees a second; beyond it a stretch is no straight one (openpilot's limit, too)
+# degrees a second; beyond it a stretch is not straight (openpilot's limit, too)
 STRAIGHT_DEG_S = 2.0
 
 

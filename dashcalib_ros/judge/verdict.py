@@ -342,8 +342,8 @@ def _turns(turns: list[TurnId]) -> str:
     return ' and '.join(names)
 
 
-# of the width, root mean square; less is no movement: KITTI 07, a fixed camera, has 0.002 at one
-# of two rates, and a crop that wanders by 0.01 has 0.0045 to 0.0095
+# of the width, root mean square; less is not a movement: KITTI 07, a fixed camera, has 0.002 at
+# one of two rates, and a crop that wanders by 0.01 has 0.0045 to 0.0095
 LEAST_MOVE = 0.003
 
 
@@ -385,7 +385,7 @@ def _not_fixed(grounds: Grounds) -> Finding | None:
                    'fix the zoom and the focus, then record another drive')
 
 
-# of the focal length; a smaller step is no reason for a verdict
+# of the focal length; a smaller step does not affect the verdict
 LEAST_STEP = 0.003
 
 

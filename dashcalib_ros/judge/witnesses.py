@@ -73,7 +73,7 @@ class SensorComparison:
     unused: tuple[Notice, ...] = ()
 
 
-# keyframes of a turn at the least
+# minimum number of keyframes of a turn
 LEAST_KEYFRAMES = 5
 
 
@@ -289,7 +289,7 @@ def _witness(inverse_scale: float, sigma: float, own_sigma: float, by_camera: Fl
              solution: Solution) -> Witness:
     """Return a witness. own_sigma: what the sensor's own scale may be off.
 
-    Of all cameras that make up for the scale the likeliest is told, given what turns know.
+    Of all cameras that make up for the scale the likeliest is named, given what turns know.
     """
     along = solution.covariance @ by_camera
     variance = float(by_camera @ along)
@@ -385,7 +385,7 @@ LARGEST_PACE = 2.0
 # s, and sigmas; turns whose own offsets are farther apart have clocks that do not keep pace
 LARGEST_SKEW_S, SKEW_SIGMAS = 0.02, 5.0
 # times what a turn's other steps leave; where an image is missing in a turn of 50 degrees or more
-# one step left 4.7 to 14 times that, and else 4.2 at the most
+# one step left 4.7 to 14 times that, and else at most 4.2
 LARGEST_JUMP = 4.5
 # a stretch that turns less shows no missing image, but a bump
 JUMPING_DEG = 30.0
@@ -397,7 +397,7 @@ class Fit:
 
     covariance: (9, 9) of the small rotation (3), bias (3), 1 / scale, offset and pace. by_camera:
     (n,) by how much 1 / scale follows the camera's parameters. explained: of the squared angles.
-    skew_s: between the turns' own offsets, where that is no chance; else 0. jump: what a step
+    skew_s: between the turns' own offsets, where that is not by chance; else 0. jump: what a step
     leaves, over the RMS of the others of its turn.
     """
 
@@ -689,7 +689,7 @@ class _End:
         return float(np.sqrt(np.mean(self.straight.left**2)))
 
 
-# degrees of a turn at the least, between two headings of GPS
+# minimum angle of a turn between two headings of GPS, degrees
 LEAST_GPS_DEG = 30.0
 
 
@@ -756,7 +756,7 @@ def _gps(turns: Sequence[Steps], position: Samples, solution: Solution, apart: s
 STRAIGHT_DEG = 1.5
 # m from the rear axle, which goes where the car points, to the aerial
 LEVER_M = 2.0
-# m of a straight at the least
+# minimum length of a straight, m
 STRAIGHT_M = 8.0
 
 

@@ -117,7 +117,7 @@ class Block:
 
 @dataclass(frozen=True)
 class SharedBlock(Block):
-    """A block of which all stretches of a camera have the same. value: (c,)."""
+    """A block with one value for all stretches of a camera. value: (c,)."""
 
     value: Floats
 
@@ -151,7 +151,7 @@ class SharedBlock(Block):
 
 @dataclass(frozen=True)
 class ImageBlock(Block):
-    """A block of which each image has its own: by stretch (k, c); none where it is not in it."""
+    """A block with a value for each image: by stretch (k, c); none where it is not in it."""
 
     value: Mapping[TurnId, Floats] = field(default_factory=dict)
 
@@ -427,7 +427,7 @@ BEND_PX = 3.0
 class Bend(SharedBlock):
     """Displacements at places over the picture, px: those in x, then those in y.
 
-    They are only asked for, never taken out of a picture.
+    They are only estimated, never removed from a picture.
     """
 
     value: Floats = field(default_factory=lambda: np.zeros(2 * BENDS[0] * BENDS[1]))
@@ -683,12 +683,12 @@ class Imaging:
 
     @property
     def shared(self) -> list[SharedBlock]:
-        """Return the free blocks of which all stretches have the same."""
+        """Return the free blocks with one value for all stretches."""
         return [block for block in self.blocks.values()
                 if isinstance(block, SharedBlock) and not block.held]
 
     def of_each_image(self, stretch: Stretch) -> list[ImageBlock]:
-        """Return the free blocks of which each image of a stretch has its own."""
+        """Return the free blocks with a value for each image of a stretch."""
         return [block for block in self.blocks.values() if isinstance(block, ImageBlock)
                 and not block.held and (self.coupled or not block.turns)
                 and block.within(stretch)]

@@ -15,7 +15,7 @@ import numpy as np
 from dashcalib_ros.arrays import Floats, Ints, Mask
 from dashcalib_ros.camera.rotation import centres_of
 
-# knots at the least, from which a spline says how the camera moved
+# minimum number of knots from which a spline says how the camera moved
 LEAST_KNOTS = 4
 
 

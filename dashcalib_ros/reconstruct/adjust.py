@@ -15,7 +15,7 @@ from dashcalib_ros.problem.observations import Stretch
 from dashcalib_ros.problem.steps import FIRST_RADIUS, State, Stepping, optimised
 from dashcalib_ros.reconstruct.scene import Scene, retriangulated
 
-# steps of one adjustment at most; 60 move fx by 0.03 % at the most, at twice the time
+# steps of one adjustment at most; 60 move fx by at most 0.03 %, in twice the time
 MAX_ITERATIONS = 12
 # no lens has a coefficient beyond this: the scene has diverged
 MAX_DISTORTION = 1.0

@@ -19,7 +19,7 @@ from dashcalib_ros.reconstruct.scene import Profile, Scene, rays_of, triangulate
 
 # of the image width; the limit of a reprojection error while the lens is still unknown
 CHAIN_ERROR = 0.004
-# points that both images of the first pair see, at the least
+# minimum number of points that both images of the first pair see
 MIN_SHARED = 40
 # points that an image must see to be tried; inliers it must have, in number and as a share
 MIN_RESECTION = 15

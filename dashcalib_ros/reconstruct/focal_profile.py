@@ -26,7 +26,7 @@ from dashcalib_ros.reconstruct.tracks import longest, spread, thinned
 COMPLETIONS = 2
 # px^2 per observation; what costs more is chained anew
 GOOD_COST = 1.2
-# of the cost of the chain before; one that costs more is no better
+# of the cost of the chain before; one that costs more is not better
 WORTH = 0.95
 NO_PROFILE = Profile(np.zeros(0), np.zeros(0), 0)
 

@@ -43,7 +43,7 @@ LEAST_NEW = 0.75
 def without_repeated(scenes: Sequence[Scene]) -> tuple[list[Scene], dict[TurnId, TurnId]]:
     """Return the scenes without those that repeat an earlier one, and which turn each repeats.
 
-    A scene of which most is new is cut to that.
+    A scene that is mostly new is cut to its new part.
     """
     kept: list[Scene] = []
     repeated: dict[TurnId, TurnId] = {}

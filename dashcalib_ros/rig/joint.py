@@ -38,7 +38,7 @@ PLACE, GAUGE = 8, 7
 # one sigma of priors. m: cameras of a car are not farther apart. log: of the metres of a scene's
 # unit, where no speed is known. Of time: quartz clocks differ by less
 REACH_M, UNKNOWN_UNIT, PACE = 2.0, 0.7, 1e-4
-# steps of the problem at the most; before some of them the noise is weighed anew
+# maximum number of steps of the problem; before some of them the noise is weighed anew
 STEPS, WEIGHED = 30, (3, 6)
 # of steps, in sigmas; below it they end
 SETTLED = 0.02

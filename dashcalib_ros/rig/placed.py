@@ -33,7 +33,7 @@ PRIOR_LEFT = 0.5
 # degrees, m and s by which one stretch may be off beyond all that is known of it: of the real
 # pair (benchmark/results/rig.md) by 0.05 degrees about the optical axis, at a sigma of 0.01
 STRETCH = np.array([0.05, 0.05, 0.05, 0.02, 0.02, 0.02, 0.0005])
-# stretches at the least for what is accepted: one alone is confirmed by nothing
+# minimum number of stretches for what is accepted: nothing confirms a single one
 LEAST_STRETCHES = 2
 # times its sigmas: stretches that differ by more contradict each other
 DISAGREE = 3.0
@@ -207,7 +207,7 @@ def base_camera(calibration: str, doubts: Sequence[Notice] = ()) -> PlacedCamera
 
 
 def not_placed(calibration: str, reason: Notice) -> PlacedCamera:
-    """Return a camera of which the drive shows nothing."""
+    """Return a camera that the drive shows nothing about."""
     return PlacedCamera(calibration, 'refused', reasons=(reason,))
 
 

@@ -21,11 +21,11 @@ from dashcalib_ros.rig.paths import CameraPaths, ScenePath
 COARSE_S, FINER_S = 0.2, (0.05, 0.01)
 # of the squared turning in two scenes; cameras that share less do not turn alike
 LEAST_EXPLAINED = 0.8
-# radians that both turned together, at the least; and what the score of a wrong offset may reach
+# minimum angle that both turned together, rad; and what the score of a wrong offset may reach
 LEAST_TURNED, RIVAL = np.radians(15.0), 0.8
 # s; farther from the best offset, another one is another alignment
 APART_S = 1.0
-# keyframes of a scene inside another one, at the least
+# minimum number of keyframes of a scene inside another one
 LEAST_SHARED = 6
 # m/s: where no speed is known, so fast a car goes
 USUAL_SPEED = 8.0

@@ -64,7 +64,7 @@ def matched(first: GreyImage, second: GreyImage) -> tuple[Floats, Floats]:
 class Fitted:
     """A rotation from the first camera's axes to the second's (3, 3), and what it leaves, (n,) px.
 
-    inside: (n,) whether a match is no wrong one. covariance: (3, 3) of the rotation; where it is
+    inside: (n,) whether a match is an inlier. covariance: (3, 3) of the rotation; where it is
     held, of nothing.
     """
 

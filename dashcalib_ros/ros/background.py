@@ -46,7 +46,7 @@ class Goal:
     config: turns.wanted counts, from the next calibration on. turns: calibrations start by
     themselves when so many are built, and again when others are among the best; None: only by
     request. camera: one in use that each new turn is compared with, to find changes. check: one
-    that each calibration is compared with, at once where it is new. Cameras are told apart as
+    that each calibration is compared with, at once where it is new. Cameras are distinguished as
     objects: news about one say which.
     """
 

@@ -29,7 +29,7 @@ from dashcalib_ros.ros.settings import NodeConfig
 
 # s; within this time others publish that they have the frame
 LISTEN_S = 2.0
-# variances of an angle and of a distance of which nothing is known, rad^2 and m^2: message types
+# variances of an unknown angle and an unknown distance, rad^2 and m^2: message types
 # have no other way to say so
 UNKNOWN, UNKNOWN_PLACE = math.pi**2 / 3, 1e6
 # sigma of what was measured by hand, m

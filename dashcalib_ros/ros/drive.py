@@ -69,7 +69,7 @@ class Role(Protocol):
         """Take a new calibration."""
 
     def outcome(self, result: Result) -> Answer:
-        """Return what a calibration says, for who asked for it."""
+        """Return what a calibration says, for the caller of the service."""
 
     def show_changes(self) -> None:
         """Take that the turns show other changes of the camera in use than before."""
@@ -316,7 +316,7 @@ class Drive:
         """Take a calibration."""
         if result.bank != self.learner.bank:
             return  # a reset came in between
-        if self.held:  # nobody knows of which camera it is
+        if self.held:  # nobody knows whose calibration it is
             self._answer(False, self.held)
             return
         found = result.calibration

@@ -92,7 +92,7 @@ class SourceWatch(Generic[T]):
         """Take the next message's source.
 
         check: raises InputError, which goes on to the caller, for a damaged message: such a one
-        is no sign of a change. It is called for few messages: not for those of the present source,
+        does not mean a change. It is called for few messages: not for those of the present source,
         nor for strays between them.
         """
         if source == self.current:

@@ -137,7 +137,7 @@ class StoredCalibration:
     def rectified(self, rectified: str) -> StoredCalibration:
         """Return it with the P of a setting, itself where the file has that already.
 
-        P is no measurement but the user's choice: the present one counts, not the file's.
+        P is not a measurement but the user's choice: the present one counts, not the file's.
         """
         p = ros_camera(self.camera.camera, rectified).p
         with suppress(KeyError, TypeError, ValueError):  # of another program's form

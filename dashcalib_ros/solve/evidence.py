@@ -53,7 +53,7 @@ SHIFT_SIZES, SHIFT_NATS = (0.0005, 0.001, 0.002, 0.004, 0.008, 0.016), 3.0
 # degrees of yaw: a stabiliser hides less in a stretch; more shows whether there is one
 HIDDEN_DEG, SHARP_DEG = 20.0, 45.0
 # sigmas of a drift of the focal length over a drive among which the evidence chooses, the first
-# as good as none, and the nats it takes; turns at the least
+# as good as none, and the nats it takes; minimum number of turns
 STEADY, DRIFTS, DRIFT_NATS, LEAST_DRIFTING = 1e-6, (0.002, 0.005, 0.015, 0.05, 0.2), 4.0, 3
 # K; a temperature that changes less says nothing: a lens grows by 0.02 % for each
 LEAST_SPAN_K = 2.0
@@ -401,6 +401,6 @@ def moves(tests: Sequence[FixedCameraTest]) -> bool:
 
 
 def largest_crop(crops: Mapping[TurnId, Floats]) -> float:
-    """Return how far the crop moved at the most, from its middle, px."""
+    """Return the largest distance of the crop from its middle, px."""
     paths = np.concatenate(list(crops.values()))
     return float(np.abs(paths - np.median(paths, axis=0)).max())

@@ -262,7 +262,7 @@ def _chosen(begun: Sequence[_Begun], config: Config
 
     A kind may lose by the bad poses of one turn only. So the others are found again from the poses
     of the best one; so is one that no turn began with, where the best one leaves much to explain,
-    and a pinhole where that sees the same. Where a model was asked for, that one stays.
+    and a pinhole where that sees the same. A model that was requested stays.
     """
     best = next(each for each in begun
                 if each.found is chosen_kind([other.found for other in begun])[0])

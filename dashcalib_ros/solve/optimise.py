@@ -118,7 +118,7 @@ class Estimate(steps.State):
 
 def optimised(start: Estimate, least_px: float, count: int, settled: float = steps.SETTLED,
               choose: bool = True) -> Estimate:
-    """Return the estimate after steps that lower its cost, so many at the most.
+    """Return the estimate after at most `count` steps that lower its cost.
 
     least_px: of the scale of the loss. settled: a smaller gain ends it. choose: the sizes of the
     priors, too.
@@ -236,7 +236,7 @@ def with_points_settled(scene: Scene, camera: Camera, loss_px: float) -> Scene:
         step = np.linalg.solve(blocks + damping, summed(weighted @ residual[:, :, None]))
         moved = points + step[:, :, 0]
         after = squares(moved)
-        # NaN, of a point that has gone behind a camera, is no gain
+        # NaN, of a point that has gone behind a camera, is not a gain
         gains = summed(np.log1p(after)) < summed(np.log1p(off))
         points = np.where(gains[:, None], moved, points)
         off = np.where(gains[point], after, off)

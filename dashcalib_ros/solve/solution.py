@@ -49,7 +49,7 @@ class FocalDrift:
 
     @property
     def largest(self) -> float:
-        """Return by how much it differs at the most between two times of the drive, of 1."""
+        """Return the largest difference between two times of the drive, of 1."""
         ways = self.ways
         steps_ns = np.array(ways.steps_ns, np.int64)
         times_ns = np.r_[ways.begin_ns, steps_ns - 1, steps_ns, ways.end_ns]

@@ -26,7 +26,7 @@ from dashcalib_ros.solve.spread import SigmaMap, sigma_over
 PLACES, GRID_WEIGHT = 600, 0.5
 # Gauss-Newton steps of a fit, and px of its last one
 STEPS, SETTLED_PX = 20, 1e-6
-# parameters that are always told: fx fy cx cy k1 k2; and px that others must be worth
+# parameters that are always written: fx fy cx cy k1 k2; and px that others must be worth
 FEW, SMALL_PX = 6, 0.02
 # keeps the field's terms small where no pixel determines them, of the number of pixels
 RIDGE = 1e-6
@@ -108,7 +108,7 @@ class _Fit:
 
 
 def written(imaging: Imaging, covariance: Floats, scenes: Sequence[Scene], model: str) -> Written:
-    """Return the camera to write. model: the one that was asked for, or auto.
+    """Return the camera to write. model: the requested one, or auto.
 
     covariance: (m, m) of what turns share. scenes: as measured.
     """

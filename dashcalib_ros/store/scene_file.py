@@ -2,7 +2,7 @@
 """Scenes in a file, without pictures: turns.store and fleets write, read and check the same.
 
 The format (docs/fleet.md): an .npz without pickle, with a JSON text `about` and arrays for each
-turn. Files come from other machines: what is no scene that this package could have made raises,
+turn. Files come from other machines: what is not a scene that this package could have made raises,
 before it takes much memory.
 """
 from __future__ import annotations
@@ -95,7 +95,7 @@ class StoredTurn:
             mine, other, rtol=0, atol=SAME_PX, equal_nan=True)
 
     def happened(self, stamp_s: float, half_width_s: float) -> bool:
-        """Return whether the turn was at this time; False if a stamp is no date."""
+        """Return whether the turn was at this time; False if a stamp is not a date."""
         return min(self.stamp_s, stamp_s) > DATES_S and abs(self.stamp_s - stamp_s) < half_width_s
 
 
