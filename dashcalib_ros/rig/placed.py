@@ -13,7 +13,7 @@ import numpy as np
 from dashcalib_ros.arrays import Floats, Mask
 from dashcalib_ros.camera.rotation import rotation_matrices, rotation_vectors
 from dashcalib_ros.config import RigConfig
-from dashcalib_ros.errors import Notice
+from dashcalib_ros.errors import Notice, counted
 from dashcalib_ros.judge.calibration import Level
 from dashcalib_ros.judge.difference import limit_of
 from dashcalib_ros.rig.joint import REACH_M, Matched, Solved, solved
@@ -223,6 +223,11 @@ def why_not_aligned(name: str, base: str, found: Aligned | None, lacking: str | 
         return Notice('E-RIG-OTHER-SIDE', f'{name} turns to the other side when {base} does: '
                       f'check that both clips are of one drive, and turn pictures upright that '
                       f'are upside down or mirrored')
+    if found.ambiguous and found.explained >= LEAST_EXPLAINED:
+        return Notice('E-RIG-AMBIGUOUS', f'{name} turns as {base} does if its clock is '
+                      f'{abs(found.apart_s):.0f} s off, which {counted(found.stretches, "turn")} '
+                      f'may show by chance: drive two turns that both see, or record both with '
+                      f'one clock')
     return Notice('E-RIG-OTHER-DRIVE', f'{name} does not turn when {base} does: at best '
                   f'{max(100 * found.explained, 0):.0f} % of its turning is explained: check that '
                   f'both clips are of one drive and one car')

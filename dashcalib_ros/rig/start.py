@@ -23,8 +23,9 @@ COARSE_S, FINER_S = 0.2, (0.05, 0.01)
 LEAST_EXPLAINED = 0.8
 # minimum angle that both turned together, rad; and what the score of a wrong offset may reach
 LEAST_TURNED, RIVAL = np.radians(15.0), 0.8
-# s; farther from the best offset, another one is another alignment
-APART_S = 1.0
+# s; farther from the best offset, another one is another alignment; and stretches that must agree
+# on clocks that are farther apart: a single turn looks like many others
+APART_S, AGREEING = 1.0, 2
 # minimum number of keyframes of a scene inside another one
 LEAST_SHARED = 6
 # m/s: where no speed is known, so fast a car goes
@@ -46,7 +47,8 @@ class Aligned:
     """How late a camera's clock is against another's; rotation (3, 3) from its axes.
 
     explained: of the squared turning that both saw. turned: rad, of that. rival: the score of the
-    next best other alignment, of the best one's.
+    next best other alignment, of the best one's. stretches: how many both saw. apart_s: how far
+    the clocks are from being one clock.
     """
 
     late_s: float
@@ -54,12 +56,20 @@ class Aligned:
     explained: float
     turned: float
     rival: float
+    stretches: int = 1
+    apart_s: float = 0.0
 
     @property
     def found(self) -> bool:
-        """Return whether both cameras turn alike."""
+        """Return whether both cameras turn alike, at one time only."""
         return (self.explained >= LEAST_EXPLAINED and self.turned >= LEAST_TURNED
-                and not self.other_side)
+                and not self.other_side and not self.ambiguous)
+
+    @property
+    def ambiguous(self) -> bool:
+        """Return whether it may be by chance that they turn alike at this time."""
+        return abs(self.apart_s) > APART_S and (
+            self.stretches < AGREEING or self.rival > RIVAL)
 
     @property
     def other_side(self) -> bool:
@@ -98,8 +108,11 @@ def aligned(camera: CameraPaths, base: CameraPaths, near_s: float | None = None,
                          key=lambda each: _score(camera, base, each)[0]))
         width = step
     score, rotation, explained, turned = _score(camera, base, late)
+    seen = {n for n, own in enumerate(camera.scenes) for its in base.scenes
+            if len(_shared(own, its, late)) >= LEAST_SHARED}
     return Aligned(late, rotation, explained, turned,
-                   max(float(others.max(initial=0.0)), 0.0) / max(score, 1e-12))
+                   max(float(others.max(initial=0.0)), 0.0) / max(score, 1e-12), len(seen),
+                   0.0 if near_s is None else late - near_s)
 
 
 def _shared(own: ScenePath, its: ScenePath, late: float) -> Floats:

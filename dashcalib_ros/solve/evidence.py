@@ -24,7 +24,16 @@ from dashcalib_ros.camera import MODELS
 from dashcalib_ros.camera.mapping import mapping_error
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.input.motion import Samples
-from dashcalib_ros.problem.blocks import Bend, Block, Drift, ImageBlock, Shift, Warmth, Zoom
+from dashcalib_ros.problem.blocks import (
+    Bend,
+    Block,
+    Drift,
+    ImageBlock,
+    Imaging,
+    Shift,
+    Warmth,
+    Zoom,
+)
 from dashcalib_ros.problem.normal import COMMON_DRIFT, Normal, normal_equations
 from dashcalib_ros.problem.quadratic import Quadratic
 from dashcalib_ros.reconstruct.scene import errors_px
@@ -337,17 +346,20 @@ def shift_size(found: Estimate) -> float:
     return best if by_size[best] - nats(None) > SHIFT_NATS else 0.0
 
 
-def drifting(found: Estimate, temperature: Samples | None = None) -> Drift | None:
+def drifting(found: Estimate, temperature: Samples | None = None) -> tuple[Drift | None, float]:
     """Return how the focal length changes, as the evidence favours it; None for a steady one.
 
     It grows steadily, or steps between two turns; or it does all of that, as a zoom, and where the
     turns do not tell which. Two turns cannot. temperature: that it goes with in the place of
     time, unless that explains it clearly better.
+
+    And the RMS change over the turns, of fx, that the evidence does not exclude where it is None:
+    a mean over a steady lens and all ways and sizes.
     """
     own_ns = [scene.tracks.stamps_ns for scene in found.scenes if scene.turn.of_this_drive]
     turns = sorted((int(stamps.min()), int(stamps.max())) for stamps in own_ns)
     if len(turns) < LEAST_DRIFTING:
-        return None
+        return None, 0.0
     begins, ends = [begin for begin, _ in turns], [*accumulate((end for _, end in turns), max)]
     # where turns overlap nothing steps between them
     steps = tuple((end + begin) // 2 for end, begin in zip(ends, begins[1:], strict=False)
@@ -365,11 +377,18 @@ def drifting(found: Estimate, temperature: Samples | None = None) -> Drift | Non
     places = np.arange(len(total.score))
     own = places[now.imaging.places[Drift.name]]
 
+    middles_ns = np.mean(turns, axis=1).astype(np.int64)
+    unnamed: list[tuple[float, float]] = []
+
     def likeliest_of(ways: Drift, kept: Ints) -> tuple[float, Drift]:
         """Return the nats over a steady focal length, and the block of the likeliest size."""
         cost = total.of(np.setdiff1d(places, np.setdiff1d(own, kept)))
         sized = [replace(ways, sigma=size) for size in (STEADY, *DRIFTS)]
         none, *nats = (evidence(cost, now.imaging.having(each), each) for each in sized)
+        if ways.size == 1:
+            spread = float(np.var(ways.grown_at(middles_ns)))
+            unnamed.extend((more - none, spread * _mean_square(cost, now.imaging.having(each)))
+                           for more, each in zip(nats, sized[1:], strict=True))
         return max(nats) - none, sized[1 + int(np.argmax(nats))]
 
     one, kept = replace(asked, value=np.zeros(1), warmth=None), own
@@ -386,11 +405,19 @@ def drifting(found: Estimate, temperature: Samples | None = None) -> Drift | Non
         alone.append((nats - float(np.log(len(steps))), step))
     (best, way), *others = sorted(alone, key=itemgetter(0), reverse=True)
     if best <= DRIFT_NATS:
-        return None
+        nats, squares = np.array(unnamed).T
+        likely = np.exp(nats) / len(nats)
+        return None, float(np.sqrt(likely @ squares / (1 + likely.sum())))
     # where another way is nearly as likely, the sigma of all of them contains it
     every, ways = likeliest_of(asked, kept)
     rival = max((nats for nats, _ in others), default=-np.inf)
-    return ways if every > best + DRIFT_NATS or rival > best - RIVAL_NATS else way
+    return ways if every > best + DRIFT_NATS or rival > best - RIVAL_NATS else way, 0.0
+
+
+def _mean_square(cost: Quadratic, imaging: Imaging) -> float:
+    """Return the mean square of a drift of one way, given the turns."""
+    known, place = Quadratic.together([cost, imaging.prior()]), imaging.places[Drift.name].start
+    return float(known.optimum[place]**2 + known.covariance[place, place])
 
 
 def moves(tests: Sequence[FixedCameraTest]) -> bool:

@@ -163,7 +163,8 @@ def _solved(per_turn: Sequence[Scene], config: Config, progress: Progress,
         progress('testing whether the picture moves', 0.0)
         best = _with(best, Shift(only=loose))
     steady = best
-    if not best.moves and (drift := drifting(best, temperature)) is not None:
+    drift, wanders = (None, 0.0) if best.moves else drifting(best, temperature)
+    if drift is not None:
         best = _with(best, drift)
         for _ in range(DRIFT_ROUNDS):
             best = _finished(best)
@@ -179,7 +180,7 @@ def _solved(per_turn: Sequence[Scene], config: Config, progress: Progress,
     elif config.intrinsics.crop_rounds and not loose and (size := shift_size(best)):
         best = _with(best, Shift(sigma=size))
         tests = fixed_camera_tests(best)
-    return _solution(best, unlike, start.profile, tried, tests, progress)
+    return _solution(best, unlike, start.profile, tried, tests, wanders, progress)
 
 
 def _begun(kind: str, per_turn: Sequence[Scene], config: Config, progress: Progress
@@ -367,13 +368,15 @@ def _posterior(found: Estimate) -> Posterior:
 
 def _solution(found: Estimate, unlike: Mapping[TurnId, float], coarse: Profile,
               tried: tuple[Candidate, ...], tests: tuple[FixedCameraTest, ...],
-              progress: Progress) -> Solution:
+              wanders: float, progress: Progress) -> Solution:
     """Return the solution with all that is known of it.
 
-    unlike: each turn's misfit. coarse: the turns' focal profiles.
+    unlike: each turn's misfit. coarse: the turns' focal profiles. wanders: RMS change of fx during
+    the drive that is not excluded, of 1.
     """
     progress('estimating the uncertainty', 0.0)
-    config, lens, posterior = found.config, found.camera, _posterior(found)
+    config, lens = found.config, found.camera
+    posterior = _posterior(found).erring_together(wanders)
     result = written(found.imaging, posterior.covariance, found.scenes, config.model)
     scenes = tuple(result.seen(scene, found.imaging) for scene in found.scenes)
     progress('trying other focal lengths', 0.0)

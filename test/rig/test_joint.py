@@ -186,6 +186,18 @@ def test_clocks_are_found_wherever_videos_start(late_s):
     assert found is not None and found.found and abs(found.late_s - late_s) < 0.03
 
 
+@pytest.mark.parametrize(('turns', 'near_s', 'found_it'), [
+    (2, 0.0, True), (1, 0.0, False), (1, 9.0, True), (1, None, True)])
+def test_one_turn_alone_does_not_say_that_clocks_are_far_apart(turns, near_s, found_it):
+    cameras = {'front': CAMERAS['front'], 'left': replace(CAMERAS['left'], late_s=9.0)}
+    paths, _ = made_paths(cameras, yaws=(85.0, -75.0))
+    left = replace(paths['left'], scenes=paths['left'].scenes[:turns])
+    found = aligned(left, paths['front'], near_s)
+    assert found is not None and abs(found.late_s - 9.0) < 0.03
+    assert found.found == found_it
+    assert found_it or why_not_aligned('left', 'front', found, None).code == 'E-RIG-AMBIGUOUS'
+
+
 def test_a_turn_to_the_other_side_is_another_drive():
     # an upright camera cannot see the car turn to the other side
     front, _ = made_paths({'front': CAMERAS['front']}, yaws=(85.0, -75.0, 60.0))
