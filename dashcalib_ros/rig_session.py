@@ -38,7 +38,6 @@ from dashcalib_ros.rig.placed import (
 from dashcalib_ros.rig.start import Aligned, Metres, aligned
 from dashcalib_ros.rig.witness import (
     Epipolar,
-    Fitted,
     fitted,
     matched,
     rays_of,
@@ -290,35 +289,40 @@ def _witnessed(learned: Mapping[str, Learned], best: Solved,
         across = best.problem.places[b].rotation @ best.problem.places[a].rotation.T
         scale = learned[a].scale.px
         held = fitted(rays, across, cameras[0].fx)
-        if held is None:
+        lenses = [best.problem.cameras[name].lens_covariance for name in (a, b)]
+        shown = rotation_by_matches((a, b), [each.widened() for each in cameras], pairs, fields,
+                                    across, [np.sqrt(np.diag(lens)) for lens in lenses])
+        # cameras that see hardly anything in common have matches by chance
+        if held is None or shown is None:
             continue
         seen = residual_over(cameras[0], xy, held)
         found[a, b] = replace(seen, median=seen.median * scale, cells_rms=seen.cells_rms * scale)
-        free = fitted(rays, across, cameras[0].fx, free=True)
-        if free is not None and (degrees := _contradicted(free, across, best, a, b)):
+        if degrees := _contradicted(shown, across, best):
             for name in {a, b} - {best.problem.base}:
                 doubts[name] = (*doubts.get(name, ()), Notice(
                     'E-RIG-EPIPOLAR', f'{name}: matches between {a} and {b} say that one is '
                     f'turned by {degrees:.2f} degrees more against the other: check that none was '
                     f'moved during the drive, or drive more turns'))
         elif use:
-            sigmas = [np.sqrt(np.diag(best.problem.cameras[name].lens_covariance))
-                      for name in (a, b)]
-            matched = rotation_by_matches((a, b), [each.widened() for each in cameras], pairs,
-                                          fields, across, sigmas)
-            used += [] if matched is None else [matched]
+            used.append(shown)
     return Witnessed(found, doubts, tuple(used))
 
 
-def _contradicted(free: Fitted, across: Floats, best: Solved, a: str, b: str) -> float:
-    """Return by how many degrees matches contradict a rotation; 0 where they do not."""
-    away = np.degrees(rotation_vectors((free.rotation @ across.T)[None])[0])
-    sigma = np.hypot(*(
-        np.degrees(best.sigma(name)[:3]) if name != best.problem.base else np.zeros(3)
-        for name in (a, b)))
-    sigma = np.hypot(sigma, np.degrees(np.sqrt(np.diag(free.covariance))))
-    beyond = np.abs(away) > np.maximum(CONTRADICTED * sigma, LEAST_APART_DEG)
-    return float(np.linalg.norm(away)) if beyond.any() else 0.0
+def _contradicted(shown: Matched, across: Floats, best: Solved) -> float:
+    """Return by how many degrees matches contradict a rotation; 0 where they do not.
+
+    What the lenses may be off belongs to both.
+    """
+    away = rotation_vectors((shown.rotation @ across.T)[None])[0]
+    variance = np.diag(shown.covariance).copy()
+    for name in (shown.a, shown.b):
+        follow = shown.follow[name]
+        variance += np.diag(follow @ best.problem.cameras[name].lens_covariance @ follow.T)
+        if name != best.problem.base:
+            variance += best.sigma(name)[:3]**2
+    beyond = np.abs(away) > np.maximum(
+        CONTRADICTED * np.sqrt(variance), np.radians(LEAST_APART_DEG))
+    return float(np.degrees(np.linalg.norm(away))) if beyond.any() else 0.0
 
 
 def _metres(learned: Mapping[str, Learned], late: Mapping[str, float]) -> Metres | None:

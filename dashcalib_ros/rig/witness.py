@@ -27,6 +27,8 @@ RATIO, FEATURES = 0.75, 3000
 LOSSES_PX, WRONG_PX = (30.0, 10.0, 3.0, 1.5, 1.0, 1.0, 1.0, 1.0), 3.0
 # columns and rows of the cells over the first picture; matches of a cell, and of a pair of cameras
 CELLS, LEAST_IN_CELL, LEAST_MATCHES = (6, 3), 15, 60
+# share of matches that fit to one rotation where both cameras see the same; by chance 3 % do
+LEAST_INSIDE = 0.4
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,8 @@ def fitted(rays: tuple[Floats, Floats], rotation: Floats, px: float, free: bool 
            ) -> Fitted | None:
     """Return how matches' rays (n, 3) fit to a rotation; free: it is refined, too.
 
-    px: of a radian. None where there are too few matches.
+    px: of a radian. None where there are too few matches, or no rotation fits to most of them:
+    cameras that see nothing in common have some by chance.
     """
     first, second = rays
     if len(first) < LEAST_MATCHES:
@@ -100,7 +103,8 @@ def fitted(rays: tuple[Floats, Floats], rotation: Floats, px: float, free: bool 
         back /= np.linalg.norm(back)
     errors = px * epipolar(turned, back, first[None], second[None])[0][0]
     inside = np.abs(errors) < WRONG_PX
-    if inside.sum() < LEAST_MATCHES:
+    least = max(LEAST_MATCHES, LEAST_INSIDE * len(first) if free else 0)
+    if inside.sum() < least:
         return None
     variance = float(np.mean((errors[inside] / px)**2))
     covariance = np.zeros((3, 3))

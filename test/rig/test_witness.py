@@ -79,3 +79,10 @@ def test_few_matches_and_dark_pictures_say_nothing():
 def test_cameras_that_look_elsewhere_see_nothing_alike():
     assert sees_alike(CAMERA, CAMERA, TRUE)
     assert not sees_alike(CAMERA, CAMERA, rotation_matrices(np.radians([[0.0, 170.0, 0.0]]))[0])
+
+
+def test_matches_by_chance_say_nothing():
+    a, b = matches()
+    shuffled = np.random.default_rng(1).permutation(b)
+    rays, _ = rays_of((CAMERA, CAMERA), [(a, shuffled)])
+    assert fitted(rays, TRUE, CAMERA.fx, free=True) is None
