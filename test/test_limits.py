@@ -58,6 +58,8 @@ def test_what_is_read_ends(tmp_path):
         read_file(tmp_path / 'x', 10, 'the mask x')
     with refused(InputError, 'E-FILE-MISSING'):
         read_file(Path('a\0b'), 10)
+    with refused(InputError, 'E-FILE-UNREADABLE', 'the mask x'):
+        read_file(tmp_path / ('x' * 300), 10, 'the mask x')
     path.write_bytes(b'\xff\xfe\0')
     with refused(InputError, 'E-FILE-NOT-TEXT', path):
         read_text(path, 10)

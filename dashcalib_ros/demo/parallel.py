@@ -10,9 +10,9 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
-from multiprocessing.synchronize import Event
-from typing import Protocol
+from contextlib import contextmanager, suppress
+from multiprocessing.connection import Connection
+from typing import Any, Protocol
 
 import cv2
 
@@ -42,8 +42,9 @@ def render_parallel(make_renderer: Callable[[], Renderer], first: int, last: int
     Raises WorkerError when a worker dies.
     """
     context = multiprocessing.get_context('spawn')
-    stop = context.Event()
-    pool = ProcessPoolExecutor(processes, context, _start, (make_renderer, stop))
+    # a pipe, as no event: setting one waits for a worker that died while it waited for it
+    stopped, stop = context.Pipe(duplex=False)
+    pool = ProcessPoolExecutor(processes, context, _start, (make_renderer, stopped))
     pending: deque[Future[list[Frame]]] = deque()
     try:
         for start in range(first, last, CHUNK):
@@ -58,8 +59,9 @@ def render_parallel(make_renderer: Callable[[], Renderer], first: int, last: int
                                              'some memory, or use fewer processes') from error
     finally:
         # a caller that stops early must not wait for frames that it does not need
-        stop.set()
+        stop.close()
         pool.shutdown(wait=True, cancel_futures=True)
+        stopped.close()
 
 
 @contextmanager
@@ -72,15 +74,16 @@ def _sigint_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _end_on(stop: Event) -> None:
-    stop.wait()
+def _end_on(stopped: Connection[Any, Any]) -> None:
+    with suppress(EOFError, OSError):
+        stopped.recv()
     os._exit(1)
 
 
-def _start(make_renderer: Callable[[], Renderer], stop: Event) -> None:
+def _start(make_renderer: Callable[[], Renderer], stopped: Connection[Any, Any]) -> None:
     """Prepare a worker."""
     global _renderer
-    threading.Thread(target=_end_on, args=(stop,), daemon=True).start()
+    threading.Thread(target=_end_on, args=(stopped,), daemon=True).start()
     cv2.setNumThreads(1)
     _renderer = make_renderer()
 

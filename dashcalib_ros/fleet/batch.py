@@ -199,8 +199,9 @@ def _place(cameras: Sequence[Camera], out: str, config: Config, engine: Engine
         if len(those) > 1:
             engine.submit(Task(place_rig, (name, those, out, config), name))
         else:
-            found[name] = str(Notice('E-RIG-ONE-CAMERA', f'only {those[0].camera} is there: name '
-                                     f'the rig in the rows of two cameras or more'))
+            found[name] = coded(Notice(
+                'E-RIG-ONE-CAMERA', f'only {those[0].camera} is there: name the rig in the rows '
+                f'of two cameras or more'))
     for name, outcome in engine.outcomes():
         found[name] = coded(outcome) if isinstance(outcome, Exception) else outcome
     return dict(sorted(found.items()))

@@ -63,7 +63,10 @@ _FOXGLOVE: Mapping[str, Sequence[tuple[str, int, int]]] = {
 
 
 def message_of(kind: str, encoding: str, raw: bytes, schema: bytes = b'') -> Any:
-    """Return the message that bytes are. kind: its type; schema: a bag's own, of protobuf.
+    """Return the message that bytes are.
+
+    kind: its type. encoding: one of ENCODINGS; topics of others are of no type that is read.
+    schema: a bag's own, of protobuf.
 
     ROS's messages are read by ROS's own definitions, not the bag's: sensor_msgs' images never
     changed, and a bag with an invalid definition of another type can still be read. Raises nearly
@@ -80,10 +83,7 @@ def message_of(kind: str, encoding: str, raw: bytes, schema: bytes = b'') -> Any
         return _of_foxglove(kind, json.loads(raw).__getitem__)
     if encoding == ROS1:
         return _as_ros(types(Stores.ROS1_NOETIC).deserialize_ros1(raw, kind))
-    if encoding == CDR:
-        return _as_ros(types(Stores.ROS2_JAZZY).deserialize_cdr(raw, kind))
-    raise InputError('E-MESSAGE-ENCODING', f'the encoding {encoding} is not supported: record it '
-                     f'as {", ".join(ENCODINGS)}')
+    return _as_ros(types(Stores.ROS2_JAZZY).deserialize_cdr(raw, kind))
 
 
 def _of_foxglove(kind: str, value_of: Callable[[str], Any]) -> Any:

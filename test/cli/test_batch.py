@@ -10,6 +10,7 @@ from made_drives import smooth, write_video
 
 from dashcalib_ros.cli import main
 from dashcalib_ros.cli.arguments import make_parser
+from dashcalib_ros.cli.batch import SHOWN
 from dashcalib_ros.cli.drive import read_config
 from dashcalib_ros.config import Config
 
@@ -35,7 +36,9 @@ def test_a_fleet_is_calibrated_here_and_nothing_is_done_twice(tmp_path, capsys):
     # refused: there is no turn
     assert code == 3
     assert 'one: refused' in text and '2 cameras: 0 accepted, 0 weak, 2 refused' in text
-    assert 'row 2 (gone.avi): there is no such file' in err and 'row 3' in err
+    problems = [line for line in err.splitlines() if ': row ' in line]
+    assert {each.partition('row ')[2].partition(':')[0]: each.rpartition(' ')[2]
+            for each in problems} == {'2 (gone.avi)': '[E-CLIP-MISSING]', '3': '[E-MANIFEST-ROW]'}
     assert json.loads((out / 'effort.json').read_text())['clips_read'] == 2
     assert (out / 'overview.html').exists() and not list(out.rglob('.writable'))
     before = (out / 'overview.html').read_bytes()
@@ -50,12 +53,30 @@ def test_a_fleet_is_calibrated_here_and_nothing_is_done_twice(tmp_path, capsys):
     assert (out / 'overview.html').read_bytes() == before
 
 
+def test_many_problems_are_counted(tmp_path, capsys):
+    (tmp_path / 'm.csv').write_text('clip,camera\n' + ''.join(f'{n}.avi,one\n' for n in range(13)))
+    code, _, err = run(capsys, tmp_path / 'm.csv', '--out', tmp_path / 'out', '--workers', '1')
+    [last] = [line for line in err.splitlines() if line.endswith('[E-CLIPS-UNREADABLE]')]
+    assert code == 3 and err.count('[E-CLIP-MISSING]') == SHOWN == 10 and ' 3 more' in last
+
+
+def test_an_interrupt_says_how_to_continue(tmp_path, capsys, monkeypatch):
+    def interrupted(cameras, out, config, engine, merge, tell):
+        raise KeyboardInterrupt
+    monkeypatch.setattr('dashcalib_ros.cli.batch.calibrate_fleet', interrupted)
+    (tmp_path / 'm.csv').write_text('clip\na.avi\n')
+    code, _, err = run(capsys, tmp_path / 'm.csv', '--out', tmp_path / 'out', '--workers', '1')
+    [line] = [line for line in err.splitlines() if line.endswith('[E-BATCH-INTERRUPTED]')]
+    assert code == 130 and '0 of 1 clip' in line and str(tmp_path / 'out') in line
+
+
 @pytest.mark.parametrize(('text', 'options', 'message'), [
-    ('clip\nä.avi\n', (), 'not UTF-8'), ('video\na.avi\n', (), 'no column clip'),
-    ('clip\na.avi\n', ('--shard', '3/2'), '--shard must be like 1/8'),
+    ('clip\nä.avi\n', (), 'E-MANIFEST-NOT-UTF8'),
+    ('video\na.avi\n', (), 'E-MANIFEST-NO-CLIP-COLUMN'),
+    ('clip\na.avi\n', ('--shard', '3/2'), 'E-SHARD-INVALID'),
     ('clip\na.avi\n', ('--workers', '0'), '--workers'),
     ('clip\na.avi\n', ('--group-by', '('), 'E-GROUP-BY-INVALID'),
-    ('clip\na.avi\n', ('--set', 'fleet.units=3'), 'did you mean'),
+    ('clip\na.avi\n', ('--set', 'fleet.units=3'), 'E-CONFIG-UNKNOWN'),
     ('clip\na.avi\n', ('--workers', '1', '--shard', '1/2'), 'not allowed with')])
 def test_bad_manifests_and_usage_are_one_line(tmp_path, capsys, text, options, message):
     (tmp_path / 'm.csv').write_bytes(text.encode('latin-1'))
@@ -68,7 +89,7 @@ def test_an_output_that_cannot_be_written(tmp_path, capsys):
     (tmp_path / 'm.csv').write_text('clip\na.avi\n')
     (tmp_path / 'out').write_text('a file')
     code, _, err = run(capsys, tmp_path / 'm.csv', '--out', tmp_path / 'out', '--workers', '1')
-    assert code == 2 and 'choose an output folder' in err
+    assert code == 2 and err.endswith('[E-OUTPUT-NOT-WRITABLE]\n')
 
 
 @pytest.mark.parametrize(('options', 'expected'), [

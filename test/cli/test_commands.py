@@ -12,6 +12,7 @@ import shutil
 import signal
 import sys
 import types
+import warnings
 from typing import ClassVar
 from unittest.mock import create_autospec
 
@@ -22,11 +23,12 @@ import pytest
 import yaml
 from fakes import called_like, stands_in_for
 from made_calibration import TRUTH, make_calibration
+from refused import refused
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 from dashcalib_ros.camera import AUTO, calibrated_models, ros_camera
-from dashcalib_ros.cli import main
+from dashcalib_ros.cli import main, program
 from dashcalib_ros.cli.arguments import make_parser
 from dashcalib_ros.cli.drive import open_drive
 from dashcalib_ros.cli.terminal import Stages
@@ -256,7 +258,7 @@ def test_an_unknown_model_is_an_error_before_a_drive_is_rendered(
         assert error.startswith('dashcalib: error: ') and error.count('\n') == 1
         assert 'mirror' in error and 'radial' in error and 'fisheye' in error
     assert names(tmp_path) == []
-    with pytest.raises(ConfigError, match='mirror'):
+    with refused(ConfigError, 'E-MODEL-UNKNOWN', 'mirror'):
         Calibrator(Config(model='mirror'))
 
 
@@ -370,6 +372,7 @@ def interrupted_while_it_waits():
     (KeyboardInterrupt(), 130, 'interrupted'),
     (interrupted_while_it_waits(), 130, 'interrupted'),
     (MemoryError(), 2, '[E-OUT-OF-MEMORY]'),
+    (BrokenPipeError(), 2, '[E-OUTPUT-CLOSED]'),
     (OSError(errno.ENOSPC, 'No space left on device', '/tmp/x'), 2, '[E-DISK-FULL]'),
     (OSError(errno.EIO, 'Input/output error', '/media/x'), 2, '[E-FILE-ACCESS]'),
     (ModuleNotFoundError("No module named 'pycolmap'", name='pycolmap'), 2,
@@ -407,18 +410,26 @@ def test_a_bag_at_the_place_of_the_results_is_told_before_the_calibration(
         fake, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     made_drives.write_bag(tmp_path / 'drive', made_drives.images(made_drives.drive(3)))
-    for bag in ('calibration', 'calibration/..'):
-        assert main(['run', 'drive', '--write-bag', bag]) == 2
-        assert '[E-OUTPUT-EXISTS]' in capsys.readouterr().err
+    for bag, code, *more in (('calibration', 'E-OUTPUT-EXISTS'),
+                             ('calibration/..', 'E-OUTPUT-EXISTS'),
+                             ('new', 'E-BAG-PART', '--crop', '0,0,32,16')):
+        assert main(['run', 'drive', '--write-bag', bag, *more]) == 2
+        assert f'[{code}]' in capsys.readouterr().err
     assert fake.made == [] and names(tmp_path) == ['drive']
 
 
 @pytest.mark.parametrize('bug', [ZeroDivisionError(), RuntimeError('release unlocked lock')])
-def test_a_bug_is_not_hidden(fake, drive, monkeypatch, bug):
+def test_a_bug_is_not_hidden(fake, drive, monkeypatch, capsys, bug):
     monkeypatch.setattr(fake, 'failure', bug)
     with pytest.raises(type(bug)):
         main(['run', drive])
     assert fake.made[0].closed
+    monkeypatch.setattr(warnings, 'showwarning', warnings.showwarning)
+    monkeypatch.setattr(sys, 'argv', ['dashcalib', 'run', drive, '--verbose'])
+    with pytest.raises(SystemExit) as ended:
+        program.command()
+    shown = capsys.readouterr().err
+    assert ended.value.code == 2 and 'Traceback' in shown and shown.endswith(' [E-DEFECT]\n')
 
 
 @pytest.mark.parametrize('name', ['SIGTERM', 'SIGINT'])
@@ -571,9 +582,13 @@ def test_stamps_columns_and_an_offset_reach_the_drive(drive, tmp_path):
     assert warm.stamps_s.tolist() == [-3600, -3590] and warm.values[1] == [21.5]
 
 
-@pytest.mark.parametrize('wrong', [
-    ['--columns', 'time=t_ms,gyro=wx'], ['--columns', 'time'], ['--sensor-offset', 'soon'],
-    ['--columns', 'time=t_ms'], ['--crop', '1,2,3']])
-def test_what_is_no_column_offset_or_part_is_refused(drive, wrong, capsys):
+@pytest.mark.parametrize(('wrong', 'code'), [
+    (['--columns', 'time=t_ms,gyro=wx'], 'E-USAGE'), (['--columns', 'time'], 'E-USAGE'),
+    (['--sensor-offset', 'soon'], 'E-USAGE'), (['--crop', '1,2,3'], 'E-USAGE'),
+    (['--columns', 'time=t_ms'], 'E-COLUMNS-WITHOUT-MOTION'),
+    (['--motion', 'log.csv', '--gps', '/fix'], 'E-MOTION-TWICE'),
+    (['--known', 'stabiliser'], 'E-KNOWN-FORM')])
+def test_what_is_no_column_offset_or_part_is_refused(drive, wrong, code, capsys):
     assert main(['run', drive, *wrong]) == 2
-    assert len(capsys.readouterr().err.splitlines()) == 1
+    [line] = capsys.readouterr().err.splitlines()
+    assert line.endswith(f' [{code}]')

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+from functools import partial
 
 import cv2
 import numpy as np
 import pytest
+from refused import refused
 
 from dashcalib_ros.camera import calibrated_models
 from dashcalib_ros.demo import (
@@ -20,11 +23,13 @@ from dashcalib_ros.demo import (
     Turn,
     demo_drive,
 )
-from dashcalib_ros.demo.atlas import pack
+from dashcalib_ros.demo.atlas import MAX_SIDE, pack
 from dashcalib_ros.demo.fisheye import WholeRaycaster
+from dashcalib_ros.demo.parallel import render_parallel
 from dashcalib_ros.demo.quads import Quads
 from dashcalib_ros.demo.raycast import Raycaster
-from dashcalib_ros.errors import ConfigError
+from dashcalib_ros.demo.rig import RIGS, rig_drives
+from dashcalib_ros.errors import ConfigError, WorkerError
 
 LENS = Lens.of(640, 360, 75.0, -0.30, 0.10, offset=(9.0, -6.0), aspect=1.003)
 SPEC = DriveSpec(turns=(Turn(80.0, 10.0),), seed=3, noise=0.0, flicker=0.0, bonnet=True)
@@ -55,10 +60,15 @@ def test_lens_inverts_exactly():
 
 
 def test_lens_that_folds_is_refused():
-    with pytest.raises(ConfigError) as error:
+    with refused(ConfigError, 'E-LENS-FOLDS'):
         Lens.of(640, 360, 110.0, -0.45, 0.0)
-    assert error.value.code == 'E-LENS-FOLDS'
     Lens.of(1392, 512, 80.0, -0.363, 0.151)
+
+
+@pytest.mark.parametrize('wrong', [{'width': 15}, {'height': 0}, {'fx': 0.0}, {'fy': -1.0}])
+def test_a_lens_without_a_picture_is_refused(wrong):
+    with refused(ConfigError, 'E-LENS-RANGE'):
+        dataclasses.replace(LENS, **wrong)
 
 
 # -- geometry ---------------------------------------------------------------------------------
@@ -322,9 +332,22 @@ def test_compression_loses_little(drive):
     {'rate': 0.0}, {'noise': -1.0}, {'exposure_ms': 300.0}, {'vignetting': 2.0},
     {'turns': (Turn(200.0),)}, {'stops': (Stop(7, 1.0),)}, {'stabilised': 0.3}])
 def test_impossible_drives_are_refused(wrong):
-    with pytest.raises(ConfigError) as error:
+    with refused(ConfigError, 'E-DRIVE-RANGE'):
         DriveSpec(**wrong)
-    assert error.value.code == 'E-DRIVE-RANGE'
+
+
+def test_what_cannot_be_rendered_is_refused():
+    with refused(ConfigError, 'E-DEMO-TOO-LONG'):
+        pack([np.zeros((2, MAX_SIDE), np.uint8)])
+    with refused(ConfigError, 'E-LENS-TOO-WIDE'):
+        WholeRaycaster(FisheyeLens.of(640, 360, 220.0), pack([np.zeros((8, 8), np.uint8)]))
+    with refused(ConfigError, 'E-DEMO-RIG-UNKNOWN', "'bus'", *RIGS):
+        rig_drives('bus')
+
+
+def test_a_process_that_dies_ends_the_rendering():
+    with refused(WorkerError, 'E-RENDERER-DIED'):
+        list(render_parallel(partial(os._exit, 1), 0, 1, 1))
 
 
 def test_a_lens_with_all_coefficients_is_opencvs_plumb_bob():
@@ -363,9 +386,8 @@ def test_a_fisheye_is_opencvs_and_inverts_exactly():
     expected, _ = cv2.fisheye.projectPoints(ahead[:, None], np.zeros(3), np.zeros(3), matrix,
                                             np.array(FISHEYE.k))
     np.testing.assert_allclose(FISHEYE.project(ahead), expected[:, 0], atol=1e-8)
-    with pytest.raises(ConfigError) as error:
+    with refused(ConfigError, 'E-LENS-FOLDS'):
         FisheyeLens.of(640, 360, 150.0, (-0.2, 0.0, 0.0, 0.0))
-    assert error.value.code == 'E-LENS-FOLDS'
 
 
 def test_a_fisheye_shows_world_points_where_it_projects_them(drive):

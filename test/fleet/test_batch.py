@@ -14,13 +14,21 @@ import numpy as np
 import pytest
 from fleet_made import CONFIG, YAWS, Here, clip_of, lens_of, written
 from made_drives import drive, images, smooth, write_bag, write_video
+from refused import refused
 from solving import remembered
 
-from dashcalib_ros.errors import ConfigError, OutputError, coded
+from dashcalib_ros.errors import ConfigError, InputError, OutputError, coded
 from dashcalib_ros.fleet import fuse, storage
 from dashcalib_ros.fleet import rigs as fleet_rigs
-from dashcalib_ros.fleet.batch import batch, cameras_of, problems, shard_of
-from dashcalib_ros.fleet.clips import GONE
+from dashcalib_ros.fleet.batch import (
+    batch,
+    cameras_of,
+    problems,
+    publish_camera,
+    shard_of,
+    solve_camera,
+)
+from dashcalib_ros.fleet.clips import GONE, ClipResult
 from dashcalib_ros.fleet.engine import LocalEngine
 from dashcalib_ros.fleet.manifest import Row, read_manifest
 from dashcalib_ros.fleet.tables import camera_folder
@@ -125,13 +133,13 @@ def test_the_tables_tell_everything(reference):
     assert status == {**{f'{n}.npz': 'used' for n in range(5)}, 'second.npz': 'used',
                       'still.avi': 'no turn', 'empty.mp4': 'unreadable', 'gone.mp4': 'unreadable'}
     assert clips[9]['status'] == 'left out' and 'row 1' in clips[9]['reason']
-    assert 'empty' in clips[7]['reason']
+    assert clips[7]['reason'].endswith('[E-FILE-EMPTY]')
     assert clips[8]['reason'].endswith('[E-CLIP-MISSING]')
     two = cameras['cam 0']
     assert two['turns_used'] == 2 == two['clips_used'] and two['clips'] == 3
     assert cameras['cam 5']['verdict'] == 'refused'
-    assert [reason.split(';')[0] for reason in cameras['cam 5']['reasons']] == [
-        'no turn was found in 1 clip']
+    assert [reason.rpartition('[')[2] for reason in cameras['cam 5']['reasons']] == [
+        'E-NO-TURN]']
     for n in range(1, 5):
         row = cameras[f'cam {n}']
         assert (row['verdict'], row['verdict_alone'], row['prior_units']) == ('weak', 'weak', 4)
@@ -212,7 +220,7 @@ def test_next_months_clips_need_no_old_video(manifest, tmp_path):
     # but another clip under its name is read
     video.write_bytes(b'')
     cameras, _ = calibrate([row], tmp_path / 'out')
-    assert 'empty' in next(problems(cameras))[1]
+    assert next(problems(cameras))[1].endswith(' [E-FILE-EMPTY]')
 
 
 def test_a_clip_that_kills_its_worker_is_set_aside(manifest, tmp_path):
@@ -242,9 +250,8 @@ def test_a_full_disk_ends_it_and_publishes_no_refusal(manifest, reference, tmp_p
             raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr('os.fsync', full)
-    with pytest.raises(OutputError) as caught:
+    with refused(OutputError, 'E-DISK-FULL'):
         run(manifest, tmp_path)
-    assert caught.value.code == 'E-DISK-FULL'
     monkeypatch.undo()
     assert not any((tmp_path / name).exists() for name in ('cameras.csv', 'overview.html'))
     assert not list(tmp_path.rglob('cameras'))
@@ -257,9 +264,8 @@ def test_a_full_scratch_disk_is_no_fault_of_a_clip(manifest, tmp_path, monkeypat
     def full(path):
         raise OSError(errno.ENOSPC, 'No space left on device')
     monkeypatch.setattr('dashcalib_ros.fleet.storage.local_copy', full)
-    with pytest.raises(OutputError) as caught:
+    with refused(OutputError, 'E-SCRATCH-FULL'):
         run(manifest, tmp_path)
-    assert caught.value.code == 'E-SCRATCH-FULL'
 
 
 def test_credentials_of_a_manifest_are_written_nowhere(tmp_path, monkeypatch):
@@ -305,6 +311,8 @@ def test_clips_that_are_not_there_cost_no_task_and_no_files(tmp_path):
     cameras, _ = calibrate(rows, tmp_path / 'out', NoWorker())
     found = list(problems(cameras))
     assert len(found) == 2002 and {why for row, why in found if row.clip} == {coded(GONE)}
+    [why] = [why for row, why in found if not row.clip]
+    assert why.endswith(' [E-MANIFEST-ROW]')
     assert not any((tmp_path / 'out' / each).exists() for each in ('cameras', 'clips'))
     told = {row['camera']: row for row in csv.DictReader(
         (tmp_path / 'out' / 'cameras.csv').read_text().splitlines())}
@@ -324,9 +332,17 @@ def test_without_pyarrow_the_tables_are_json_lines(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize('text', ['0/2', '3/2', '1', '1/0', 'a/b', '-1/2', ''])
 def test_bad_shards(text):
-    with pytest.raises(ConfigError) as caught:
+    with refused(ConfigError, 'E-SHARD-INVALID'):
         shard_of(text)
-    assert caught.value.code == 'E-SHARD-INVALID'
+
+
+@pytest.mark.parametrize('use', [
+    lambda out: publish_camera('solved/00/1.json', None, [], out),
+    lambda out: solve_camera('cam', '', [
+        (Row(1, 'a.mp4', '/a.mp4', 'cam'), ClipResult(file='gone.npz'))], out, SETTINGS)])
+def test_what_was_removed_from_the_output_meanwhile_is_named(tmp_path, use):
+    with refused(InputError, 'E-FLEET-FILE-CHANGED'):
+        use(str(tmp_path))
 
 
 def hostile(data, place):
@@ -356,6 +372,8 @@ def test_a_hostile_clip_costs_its_row_only(tmp_path):
             for n, name in enumerate(['0.npz', *bad, '1.npz'], 1)]
     cameras, _ = calibrate(rows, tmp_path / 'out')
     assert [row.clip for row, _ in problems(cameras)] == bad
+    codes = [why.rpartition('[')[2] for _, why in problems(cameras)]
+    assert codes == ['E-GATHERED-DAMAGED]'] * (len(bad) - 2) + ['E-FILE-NOT-REGULAR]'] * 2
     camera, = rows_of(tmp_path / 'out' / 'cameras.parquet')
     assert (camera['clips_used'], camera['clips_unreadable']) == (2, len(bad))
     assert not list(tmp_path.rglob('*escaped*'))
@@ -416,7 +434,8 @@ def test_the_cameras_of_a_car_are_a_rig(tmp_path, monkeypatch):
     rigs = fleet(tmp_path, rows)
     # two small turns are few
     assert rigs['car 1'] == {'front': 'accepted', 'side': 'weak', 'rear': 'refused'}
-    assert 'alone' in rigs['car 2'] and set(rigs) == {'car 1', 'car 2'}
+    assert 'alone' in rigs['car 2'] and rigs['car 2'].endswith(' [E-RIG-ONE-CAMERA]')
+    assert set(rigs) == {'car 1', 'car 2'}
     folder, = (tmp_path / 'out' / 'rigs').iterdir()
     found = load_rig(folder)
     side = found.cameras['side']

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import fleet_tasks
 import pytest
+from refused import refused
 
 from dashcalib_ros.errors import ConfigError, InputError, WorkerError
 from dashcalib_ros.fleet.engine import DiedError, LocalEngine, RayEngine, Task
@@ -66,12 +67,12 @@ def test_ray(tmp_path, monkeypatch):
         cluster.shutdown()
 
 
-def test_ray_that_has_ended_is_one_line(monkeypatch):
-    """A killed raylet: Ray raises it from get()."""
+def ray_that_raises(monkeypatch, error):
+    """Return an engine with one task, from whose outcome Ray raises an error of this name."""
     ray = pytest.importorskip('ray')
 
     def dead(reference):
-        raise ray.exceptions.LocalRayletDiedError
+        raise getattr(ray.exceptions, error)
 
     remote = SimpleNamespace(remote=lambda *arguments: 'reference')
     for name, value in {
@@ -82,20 +83,29 @@ def test_ray_that_has_ended_is_one_line(monkeypatch):
         monkeypatch.setattr(ray, name, value)
     engine = RayEngine(3, 100, 'auto')
     engine.submit(Task(fleet_tasks.double, (1,), 'a'))
-    with pytest.raises(WorkerError) as caught:
+    return engine
+
+
+def test_ray_that_has_ended_is_one_line(monkeypatch):
+    """A killed raylet: Ray raises it from get()."""
+    engine = ray_that_raises(monkeypatch, 'LocalRayletDiedError')
+    with refused(WorkerError, 'E-RAY-ENDED'):
         list(engine.outcomes())
-    assert caught.value.code == 'E-RAY-ENDED' and len(str(caught.value).splitlines()) == 1
+
+
+def test_what_ray_could_not_run_is_the_outcome_of_that_task(monkeypatch):
+    engine = ray_that_raises(monkeypatch, 'TaskCancelledError')
+    [(about, outcome)] = engine.outcomes()
+    assert (about, type(outcome), outcome.code) == ('a', WorkerError, 'E-RAY-TASK-FAILED')
 
 
 def test_a_cluster_says_which_extra_it_needs(monkeypatch):
     monkeypatch.setitem(sys.modules, 'ray', None)
-    with pytest.raises(ConfigError, match=r'ray.*\[fleet\]') as caught:
+    with refused(ConfigError, 'E-EXTRA-NOT-INSTALLED', 'ray', '[fleet]'):
         RayEngine(3, 100, 'auto')
-    assert caught.value.code == 'E-EXTRA-NOT-INSTALLED'
 
 
 def test_no_cluster_is_one_line():
     pytest.importorskip('ray')
-    with pytest.raises(WorkerError) as caught:
+    with refused(WorkerError, 'E-RAY-NOT-REACHABLE'):
         RayEngine(3, 100, 'auto')
-    assert caught.value.code == 'E-RAY-NOT-REACHABLE' and len(str(caught.value).splitlines()) == 1

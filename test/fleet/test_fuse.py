@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 from fleet_made import CONFIG, YAWS, clip_of, lens_of
 from made_lines import made_lines
+from refused import refused
 from synthetic import LENS
 
 from dashcalib_ros.detect import TurnId, bend
+from dashcalib_ros.errors import InputError
 from dashcalib_ros.fleet import solved
 from dashcalib_ros.fleet.fuse import fuse
+from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.report import report_html
 from dashcalib_ros.solve import solve
 from dashcalib_ros.store.scene_file import Origin, decoded, encoded
@@ -23,9 +26,11 @@ CLIPS = {f'{n}.mp4': clip_of(yaws=YAWS[n:n + 1], world=n, **FEW) for n in range(
 
 @pytest.fixture(scope='module')
 def fused():
-    """Four good clips, one twice, one zoomed, one of another size, one without turns."""
+    """Four good clips, one twice, one zoomed, some of another size, one without turns."""
     smaller = replace(clip_of(yaws=(), world=70), origin=Origin((640, 480)))
-    odd = {'again.mp4': CLIPS['0.mp4'], 'small.mp4': smaller,
+    enlarged = replace(smaller, content=f'{71:032x}',
+                       origin=Origin(LENS.image_size, Scale(enlarge=2)))
+    odd = {'again.mp4': CLIPS['0.mp4'], 'small.mp4': smaller, 'enlarged.mp4': enlarged,
            'straight.mp4': clip_of(yaws=(), world=60),
            'zoomed.mp4': clip_of(lens_of(1.2), YAWS[4:5], world=40, **FEW)}
     return fuse('cam', 'acme', odd | CLIPS, CONFIG)
@@ -33,14 +38,17 @@ def fused():
 
 def test_what_contradicts_is_named_and_left_out(fused):
     shares = fused.shares
-    assert shares['again.mp4'].left_out == 'has the same content as 0.mp4 [E-CLIP-REPEATED]'
+    for name, code in {'again': 'REPEATED', 'small': 'OTHER-SIZE', 'enlarged': 'OTHER-SETTINGS',
+                       'zoomed': 'OTHER-CAMERA'}.items():
+        assert shares[f'{name}.mp4'].left_out.endswith(f' [E-CLIP-{code}]')
+    assert '0.mp4' in shares['again.mp4'].left_out
     assert all(size in shares['small.mp4'].left_out for size in ('640x480', '800x450'))
-    assert shares['zoomed.mp4'].left_out.startswith('shows another camera')
     assert [shares[f'{n}.mp4'].used for n in range(4)] == [1, 1, 1, 1]
     assert not shares['straight.mp4'].left_out
     warnings = '; '.join(fused.calibration.warnings)
     assert {each.code for each in fused.calibration.warnings} == {'E-CLIP-LEFT-OUT'}
-    assert all(name in warnings for name in ('again.mp4', 'small.mp4', 'zoomed.mp4'))
+    assert all(name in warnings for name in (
+        'again.mp4', 'small.mp4', 'enlarged.mp4', 'zoomed.mp4'))
 
 
 def test_turns_are_named_by_their_clips(fused):
@@ -50,9 +58,9 @@ def test_turns_are_named_by_their_clips(fused):
     page = report_html(again)
     assert 'earlier' not in page and '0.mp4' in page
     sharp = replace(CONFIG, verdict=replace(CONFIG.verdict, max_leverage=0.1))
-    reasons = '; '.join(fuse('cam', '', CLIPS, sharp).calibration.verdict.reasons)
-    assert 'no other turn confirms 1 turn of' in reasons and '.mp4' in reasons
-    assert 'earlier' not in reasons
+    verdict = fuse('cam', '', CLIPS, sharp).calibration.verdict
+    [reason] = [each for each in verdict.reasons if each.code == 'E-ONE-TURN-DOMINATES']
+    assert '.mp4' in reason and 'earlier' not in '; '.join(verdict.reasons)
 
 
 def with_lines(lens):
@@ -110,7 +118,7 @@ def test_one_clip_with_many_turns_does_not_decide_the_size():
     many = clip_of(yaws=YAWS, world=50, tracks=60, keyframes=7)
     clips = {'many.npz': replace(many, origin=Origin((640, 450))), **first_two()}
     shares = fuse('cam', 'acme', clips, CONFIG).shares
-    assert shares['many.npz'].left_out.startswith('is 640x450')
+    assert shares['many.npz'].left_out.endswith(' [E-CLIP-OTHER-SIZE]')
 
 
 # stretches of ten clips, with less yaw than a turn
@@ -167,11 +175,28 @@ def test_a_solved_camera_comes_back_from_its_file(fused):
     np.testing.assert_array_equal(found.estimate.covariance, fused.estimate.covariance)
 
 
-@pytest.mark.parametrize(('clips', 'reason'), [
-    ({}, 'none of its clips could be read'),
-    ({'a': clip_of(yaws=(), world=1), 'b': clip_of(yaws=(), world=2)},
-     'no turn was found in 2 clips')])
-def test_nothing_to_solve_is_refused_with_the_reason(clips, reason):
+def scrambled():
+    """Return a clip with a turn whose tracks are of no scene."""
+    clip, rng = clip_of(**FEW), np.random.default_rng(0)
+    [turn] = clip.turns
+    tracks = replace(turn.scene.tracks, xy=rng.uniform(
+        0, 400, turn.scene.tracks.xy.shape).astype(np.float32))
+    return replace(clip, turns=(replace(turn, scene=replace(turn.scene, tracks=tracks)),))
+
+
+@pytest.mark.parametrize('spoil', [
+    lambda data: data[:len(data) // 2], lambda data: b'{}', lambda data: b'[1]'])
+def test_a_damaged_file_of_a_solved_camera_is_named(fused, spoil):
+    with refused(InputError, 'E-FLEET-FILE-DAMAGED', 'the/file.json'):
+        solved.decoded(spoil(solved.encoded(fused)), 'the/file.json')
+
+
+@pytest.mark.parametrize(('clips', 'code'), [
+    ({}, 'E-NO-CLIP'),
+    ({'a': clip_of(yaws=(), world=1), 'b': clip_of(yaws=(), world=2)}, 'E-NO-TURN'),
+    ({'a': replace(clip_of(yaws=(), world=1), found=1)}, 'E-NO-SCENE'),
+    ({'a': scrambled()}, 'E-NO-COMMON-CAMERA')])
+def test_nothing_to_solve_is_refused_with_the_reason(clips, code):
     found = fuse('cam', 'acme', clips, CONFIG)
     assert found.estimate is None and found.calibration.verdict.level == 'refused'
-    assert reason in found.calibration.verdict.reasons[0]
+    assert found.calibration.verdict.codes[0] == code

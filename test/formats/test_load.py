@@ -11,6 +11,7 @@ import pycolmap
 import pytest
 from made_calibration import EACH_MODEL, SIZE, TRUTH
 from made_drives import ROS1, START, drive, images, info_of, write_bag
+from refused import refused
 from rosbags.rosbag1 import Writer as Writer1
 
 from dashcalib_ros.camera import Brown, Fisheye, Radial, Rational
@@ -466,18 +467,16 @@ def test_a_model_that_colmap_wrote(tmp_path):
         folder = tmp_path / name
         folder.mkdir()
         write(str(folder))
-        with pytest.raises(InputError, match='2 cameras') as several:
+        with refused(InputError, 'E-CAMERA-CHOICE', '2 cameras'):
             load_camera(folder)
-        assert several.value.code == 'E-CAMERA-CHOICE'
         for number, lens in ((1, BROWN), (2, FISHEYE)):
             read = load_camera(f'{folder}:{number}').camera
             assert type(read) is type(lens)
             np.testing.assert_allclose(read.params, lens.params, rtol=1e-12)
     path = tmp_path / 'binary' / 'cameras.bin'
     path.write_bytes(path.read_bytes()[:-3])
-    with pytest.raises(InputError, match='model_converter') as broken:
+    with refused(InputError, 'E-COLMAP-BINARY', 'model_converter'):
         load_camera(path)
-    assert broken.value.code == 'E-COLMAP-BINARY'
 
 
 ECHO = """header:
@@ -581,7 +580,7 @@ def test_no_distortion_has_many_names(tmp_path, model, d, r):
 def test_a_name_of_no_distortion_is_none_where_there_is_some(tmp_path):
     path = tmp_path / 'info.yaml'
     path.write_text(ECHOES[0].replace('plumb_bob', "''"))
-    with pytest.raises(InputError, match=r'with .* coefficients'):
+    with refused(InputError, 'E-MODEL-DISTORTION', path):
         load_camera(path)
 
 
@@ -617,7 +616,7 @@ def test_ros_writes_ini_files_too(tmp_path):
         load_camera(path)
     assert raised.value.code == 'E-CAMERA-CHOICE'
     path.write_text('[image]\nwidth\n640\n[a]\ncamera matrix\n1 2 x\n')
-    with pytest.raises(InputError, match=r'ost\.txt'):
+    with refused(InputError, 'E-CALIBRATION-COUNT', 'ost.txt'):
         load_camera(path)
 
 
@@ -761,10 +760,8 @@ def hostile_npz(kind, path):
 @pytest.mark.parametrize('kind', ['pickled', 'parts', 'ZIP_BZIP2', 'ZIP_LZMA', 'ZIP_STORED'])
 def test_a_hostile_npz_is_one_line_and_runs_nothing(tmp_path, kind):
     hostile_npz(kind, tmp_path / 'a.npz')
-    with pytest.raises(InputError, match=r'a\.npz') as caught:
-        load_camera(tmp_path / 'a.npz')
     # a part that is too large is not read
-    assert caught.value.code == (
-        'E-CALIBRATION-FORMAT' if kind == 'ZIP_STORED' else 'E-CALIBRATION-NPZ')
-    assert len(str(caught.value).splitlines()) == 1
+    code = 'E-CALIBRATION-FORMAT' if kind == 'ZIP_STORED' else 'E-CALIBRATION-NPZ'
+    with refused(InputError, code, 'a.npz'):
+        load_camera(tmp_path / 'a.npz')
     assert [each.name for each in tmp_path.iterdir()] == ['a.npz']

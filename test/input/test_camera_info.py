@@ -137,6 +137,30 @@ def test_what_cannot_be_done_is_said_before_the_calibration(bag, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ['drive']
 
 
+@pytest.fixture
+def other_topics(tmp_path):
+    """A bag whose camera_info is none, and one with a message type that it does not define."""
+    for name, kind, options in (
+            ('taken', 'std_msgs/msg/String', {'typestore': TYPES}),
+            ('unknown', 'car_msgs/msg/Car', {'msgdef': '', 'rihs01': 'RIHS01_0'})):
+        with Writer(tmp_path / name, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+            for topic, of, more in (
+                    ('/cam/image_raw', 'sensor_msgs/msg/Image', {'typestore': TYPES}),
+                    ('/cam/camera_info', kind, options)):
+                writer.write(writer.add_connection(topic, of, **more), START, bytes(8))
+    return tmp_path
+
+
+def test_a_topic_that_camera_info_cannot_have_is_told_before_the_calibration(other_topics):
+    with refused(InputError, 'E-BAG-TOPIC-TAKEN', 'std_msgs/msg/String', '/cam/camera_info'):
+        check_bag(other_topics / 'taken', '/cam/image_raw', other_topics / 'out')
+
+
+def test_a_message_type_that_nobody_knows_is_named(other_topics):
+    with refused(InputError, 'E-BAG-TYPE-UNKNOWN', 'car_msgs/msg/Car', '/cam/camera_info'):
+        write_bag(other_topics / 'unknown', '/other/image_raw', CAMERA, other_topics / 'out')
+
+
 @pytest.mark.parametrize(('place', 'code'), [
     ('file/bag', 'E-OUTPUT-NOT-WRITABLE'), ('link', 'E-OUTPUT-EXISTS'),
     ('x' * 252, 'E-OUTPUT-NOT-WRITABLE'), ('/proc/bag', 'E-OUTPUT-NOT-WRITABLE')])
@@ -162,5 +186,5 @@ def test_the_command_says_why_there_is_no_bag(bag, tmp_path):
     command = [sys.executable, '-m', 'dashcalib_ros', 'run', str(bag), '--out',
                str(tmp_path / 'result'), '--write-bag', str(tmp_path / 'new')]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 3 and 'no bag was written' in done.stderr, done.stderr
+    assert done.returncode == 3 and '[E-BAG-NOT-WRITTEN]' in done.stderr, done.stderr
     assert not (tmp_path / 'new').exists()

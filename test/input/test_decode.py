@@ -208,13 +208,23 @@ def test_junk_is_an_error(data):
         decode(compressed_message(format='jpeg', data=data))
 
 
-@pytest.mark.parametrize('extension', ['.jpg', '.png', '.bmp', '.tif', '.webp', '.pgm'])
-def test_a_cut_picture_is_never_half_shown(extension):
+@pytest.mark.parametrize(('extension', 'code'), [
+    ('.jpg', 'E-IMAGE-TRUNCATED'), *((each, 'E-IMAGE-DAMAGED') for each in (
+        '.png', '.bmp', '.tif', '.webp', '.pgm'))])
+def test_a_cut_picture_is_never_half_shown(extension, code):
     noise = np.random.default_rng(1).integers(0, 256, (60, 80), np.uint8)
     data = cv2.imencode(extension, noise)[1].tobytes()
     assert decode_file(data).shape == noise.shape
-    with pytest.raises(InputError):
+    with refused(InputError, code):
         decode_file(data[:int(0.7 * len(data))])
+
+
+@pytest.mark.parametrize(('width', 'height'), [(3, 2), (2, 3)])
+def test_planes_of_an_odd_size_have_no_colours(width, height):
+    planes = message('nv12', np.zeros((height * 3 // 2, width), np.uint8), height=height)
+    assert decode(planes).shape == (height, width)
+    with refused(InputError, 'E-IMAGE-CONVERSION', f'{width}x{height * 3 // 2}'):
+        decode(planes, colour=True)
 
 
 def test_float_pictures_are_refused():

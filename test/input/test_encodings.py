@@ -29,6 +29,7 @@ from dashcalib_ros.formats import export, load_camera
 from dashcalib_ros.input.bag_write import check_bag, first_camera_info, write_bag
 from dashcalib_ros.input.encodings import message_of, types
 from dashcalib_ros.input.inputs import open_frames
+from dashcalib_ros.input.packets import PacketDecoder
 
 LENS = Radial(SIZE, 50.0, 51.0, 31.0, 23.0, -0.1, 0.01)
 FURTHER = types(Stores.ROS2_JAZZY)
@@ -92,7 +93,8 @@ def test_a_video_of_other_codecs_is_decoded_without_hardware(tmp_path, kind, cod
     assert np.allclose(brightness(source), range(20), atol=1) and not source.warnings
     late = open_frames(write_packets(tmp_path / 'late', packets[3:], kind, name))
     assert np.allclose(brightness(late), range(8, 20), atol=1)
-    assert 'the first 5 images' in ' '.join(late.warnings)
+    assert [each.code for each in late.warnings] == ['E-VIDEO-BEGINS-LATE']
+    assert 'the first 5 images' in late.warnings[0]
 
 
 def test_a_decoder_that_fails_is_named(tmp_path, monkeypatch):
@@ -138,7 +140,8 @@ def test_a_recording_that_begins_late_waits_for_a_key_picture(tmp_path, codec):
     frames = list(source)
     assert brightness(frames) == list(range(8, 20))
     assert [frame.index for frame in frames] == list(range(5, 17))
-    assert 'the first 5 images' in ' '.join(source.warnings)
+    assert [each.code for each in source.warnings] == ['E-VIDEO-BEGINS-LATE']
+    assert 'the first 5 images' in source.warnings[0]
 
 
 def test_damaged_packets_are_counted_and_the_rest_is_shown(tmp_path):
@@ -147,6 +150,10 @@ def test_damaged_packets_are_counted_and_the_rest_is_shown(tmp_path):
     source = open_frames(write_packets(tmp_path / 'bag', packets, PACKET, 'libx264'))
     shown = brightness(source)
     assert set(range(20)) - set(shown) <= {4} and len(shown) >= 19
+    decoder = PacketDecoder()
+    assert len(decoder.take('h264', packets[0][1], 0)) == 1
+    with refused(InputError, 'E-VIDEO-PACKET'):
+        decoder.take('h264', packets[4][1], 4)
     junk = [(n, bytes([n]) * 40) for n in range(9)]
     with refused(InputError, 'E-INPUT-NO-IMAGES', tmp_path / 'junk'):
         list(open_frames(write_packets(tmp_path / 'junk', junk, PACKET, 'libx264')))

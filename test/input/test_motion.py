@@ -6,6 +6,7 @@ import struct
 import sys
 import tracemalloc
 from datetime import datetime, timezone
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from made_gopro import gopro
 from refused import refused
 
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.input import mp4_sensors
+from dashcalib_ros.input import motion_files, mp4_sensors
 from dashcalib_ros.input.inputs import open_frames
 from dashcalib_ros.input.motion import (
     DEGREE_M,
@@ -231,6 +232,15 @@ def test_without_its_reader_the_line_says_what_to_install(tmp_path, monkeypatch)
         read_motion(write(tmp_path / 'drive.mp4', 'x'))
 
 
+@pytest.mark.parametrize('error', [OSError, BaseException])
+def test_a_video_on_which_its_reader_fails_is_one_line(tmp_path, monkeypatch, error):
+    def panic(path):
+        raise error('called `Option::unwrap()`\non a `None` value')
+    monkeypatch.setitem(sys.modules, 'telemetry_parser', SimpleNamespace(Parser=panic))
+    with refused(InputError, 'E-MOTION-VIDEO', 'drive.mp4'):
+        read_motion(write(tmp_path / 'drive.mp4', 'x'))
+
+
 def test_a_kitti_oxts_folder_counts_from_its_first_image(tmp_path):
     data = tmp_path / 'oxts' / 'data'
     data.mkdir(parents=True)
@@ -249,6 +259,14 @@ def test_a_kitti_oxts_folder_counts_from_its_first_image(tmp_path):
         assert found.speed.values[0, 0] == 7.0
     with refused(InputError, 'E-MOTION-FOLDER', data):
         read_motion(data)
+    write(tmp_path / 'oxts' / 'timestamps.txt', 'none\n')
+    with refused(InputError, 'E-MOTION-KITTI', 'timestamps.txt'):
+        read_motion(tmp_path)
+    write(tmp_path / 'oxts' / 'timestamps.txt', '2011-09-26 13:02:25.0\n')
+    for path in sorted(data.iterdir())[1:]:
+        path.unlink()
+    with refused(InputError, 'E-MOTION-KITTI', data, '1 records'):
+        read_motion(tmp_path)
 
 
 def test_records_of_oxts_have_the_time_of_their_number(tmp_path):
@@ -414,13 +432,16 @@ def test_without_sensors_a_bag_has_none(tmp_path):
     assert bag_motion([write_bag(tmp_path / 'bag', images(drive(3)))], NONE) is None
 
 
-def test_of_several_topics_none_is_used_until_one_is_chosen(tmp_path):
+def test_of_several_topics_none_is_used_until_one_is_chosen(tmp_path, monkeypatch):
     path = write_bag(tmp_path / 'bag', [
         *(imu(n) for n in range(20)), *(imu(n, '/other') for n in range(20))])
     found = bag_motion([path], NONE)
     [line] = found.warnings
     assert found.empty and line.code == 'E-MOTION-TOPICS' and '/imu, /other' in line
     assert bag_motion([path], {'imu': 'other'}).rate is not None
+    monkeypatch.setattr(motion_files, 'SAMPLES', 19)
+    [line] = bag_motion([path], {'imu': 'other'}).warnings
+    assert line.code == 'E-MOTION-TOO-LONG' and '/other' in line
     with refused(InputError, 'E-BAG-TOPIC-UNKNOWN', "imu topic '/none'", '/imu, /other'):
         bag_motion([path], {'imu': '/none'})
 

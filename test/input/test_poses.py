@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from refused import refused
 from synthetic import rotation
 
 from dashcalib_ros.errors import InputError
@@ -68,10 +69,8 @@ def test_tums_poses_are_interpolated_at_the_frames_stamps(tmp_path):
 def test_what_is_no_file_of_poses_is_named(tmp_path, text, code):
     path = tmp_path / 'poses.txt'
     path.write_text(text)
-    with pytest.raises(InputError) as caught:
+    with refused(InputError, code, path):
         read_poses(path)
-    assert caught.value.code == code
-    assert str(path) in str(caught.value) and len(str(caught.value).splitlines()) == 1
 
 
 @pytest.mark.parametrize(('unit', 'digits', 'word'), [
@@ -90,7 +89,7 @@ def test_stamps_since_1970_may_be_of_any_unit_which_is_said(tmp_path, unit, digi
 def test_nanoseconds_since_a_computer_was_started_are_no_milliseconds_since_1970(tmp_path):
     path = tmp_path / 'poses.txt'
     path.write_text(''.join(f'{5 * 10**12 + n * 10**8} 0 0 0 0 0 0 1\n' for n in range(5)))
-    with pytest.raises(InputError, match=r'poses\.txt'):
+    with refused(InputError, 'E-STAMP-UNIT', 'poses.txt'):
         read_poses(path)
 
 

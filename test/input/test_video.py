@@ -14,9 +14,12 @@ import pytest
 from av.stream import Disposition
 from made_calibration import make_calibration
 from made_drives import TIMES, fails, number, numbered, write_timed
+from refused import refused
 
 from dashcalib_ros.camera import Radial
+from dashcalib_ros.errors import InputError
 from dashcalib_ros.input.inputs import open_frames
+from dashcalib_ros.input.video import FramePicture
 from dashcalib_ros.session import calibrate, with_source
 
 
@@ -208,9 +211,14 @@ def test_a_camera_of_stretched_pictures_is_told_for_the_stored_ones(tmp_path):
         assert stored.fx == 120.0 and stored.fy == 241.0
         np.testing.assert_allclose(source.shown(stored).params, shown.params)
     calibration = replace(make_calibration(), camera=shown, image_size=(320, 64))
-    assert with_source(calibration, open_frames(path)).warnings[-1] == (
-        'for the pictures as they are stored (160x64): fx 120.00, fy 241.00, cx 78.75, cy 30.00, '
-        'and the same distortion')
+    said = with_source(calibration, open_frames(path)).warnings[-1]
+    assert said.code == 'E-PIXELS-STORED' and '160x64' in said
+    assert 'fx 120.00, fy 241.00, cx 78.75, cy 30.00' in said
+
+
+def test_pixels_that_nothing_converts_are_named():
+    with refused(InputError, 'E-VIDEO-UNDECODABLE'):
+        FramePicture()(av.VideoFrame(64, 48, 'gray32le'))
 
 
 def write_streams(path, shades, thumbnail=False):

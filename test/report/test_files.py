@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 import yaml
 from made_calibration import TRUTH, make_calibration
+from refused import refused
 
 from dashcalib_ros.errors import OutputError
 from dashcalib_ros.formats import load_camera
@@ -108,9 +109,8 @@ def test_what_cannot_be_moved_is_an_error_and_leaves_no_empty_backup(tmp_path, m
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
     (tmp_path / 'camera.yaml').write_text('x')
     monkeypatch.setattr(Path, 'replace', refuse)
-    with pytest.raises(OutputError, match=r'camera\.yaml') as caught:
+    with refused(OutputError, 'E-FILE-NOT-MOVED', 'camera.yaml'):
         set_aside(tmp_path / 'camera.yaml')
-    assert caught.value.code == 'E-FILE-NOT-MOVED'
     assert names(tmp_path) == ['camera.yaml']
 
 
@@ -167,9 +167,8 @@ def test_a_full_disk_changes_nothing(tmp_path, monkeypatch, failing):
         if len(calls) == failing:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     monkeypatch.setattr(os, 'fsync', full)
-    with pytest.raises(OutputError, match='No space left') as caught:
+    with refused(OutputError, 'E-DISK-FULL'):
         write_results(make_calibration(), tmp_path)
-    assert caught.value.code == 'E-DISK-FULL'
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
@@ -184,9 +183,8 @@ def test_ctrl_c_while_writing_leaves_nothing(tmp_path, monkeypatch):
 
 def test_a_folder_in_the_way_is_told_and_nothing_is_written(tmp_path):
     (tmp_path / 'result.json').mkdir()
-    with pytest.raises(OutputError) as caught:
+    with refused(OutputError, 'E-NAME-TAKEN'):
         write_results(make_calibration(), tmp_path)
-    assert caught.value.code == 'E-NAME-TAKEN'
     assert names(tmp_path) == ['result.json']
 
 
@@ -210,9 +208,8 @@ def test_a_report_that_does_not_fit_costs_itself_only(tmp_path):
     assert sorted(written.files) == sorted(tmp_path.iterdir())
     assert [each.code for each in written.lost] == ['E-REPORT-NOT-WRITTEN']
     assert load_camera(tmp_path / 'calibration.yaml').camera == TRUTH
-    with room_for(100), pytest.raises(OutputError) as caught:
+    with room_for(100), refused(OutputError, 'E-DISK-FULL'):
         write_results(make_calibration(), tmp_path)
-    assert caught.value.code == 'E-DISK-FULL'
 
 
 def test_a_report_whose_name_is_taken_costs_itself_only(tmp_path):
@@ -254,19 +251,19 @@ def test_a_weak_calibration_of_another_program_is_kept(tmp_path, level):
 def test_a_file_where_the_folder_should_be(tmp_path):
     (tmp_path / 'out').write_text('I was here')
     for folder in (tmp_path / 'out', tmp_path / 'out' / 'deeper'):
-        with pytest.raises(OutputError) as caught:
+        with refused(OutputError, 'E-NAME-TAKEN', folder):
             check_writable(folder)
-        assert caught.value.code == 'E-NAME-TAKEN' and str(folder) in str(caught.value)
     assert (tmp_path / 'out').read_text() == 'I was here'
 
 
-def test_a_place_that_may_not_be_written(tmp_path, monkeypatch):
+@pytest.mark.parametrize(('number', 'code'), [
+    (errno.EACCES, 'E-NOT-WRITABLE'), (errno.EIO, 'E-CANNOT-WRITE')])
+def test_a_place_that_may_not_be_written(tmp_path, monkeypatch, number, code):
     def refuse(self, *args, **options):
-        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(self))
+        raise OSError(number, os.strerror(number), str(self))
     monkeypatch.setattr(Path, 'open', refuse)
-    with pytest.raises(OutputError) as caught:
+    with refused(OutputError, code, tmp_path):
         check_writable(tmp_path)
-    assert caught.value.code == 'E-NOT-WRITABLE'
 
 
 def test_checking_leaves_an_empty_folder(tmp_path):
