@@ -21,6 +21,7 @@ import child_tasks
 import cv2
 import numpy as np
 import pytest
+from refused import refused
 from shared_drive import LENS, ONE_TURN, OTHER_TURN, QUICK, SharedDrive
 from synthetic import synthetic_turn
 
@@ -159,7 +160,7 @@ def test_a_turn_during_which_the_car_stood_is_none(frames, result):
         none = calibrator.calibrate(final=False)
     assert {turn.id: turn.unused_because for turn in found.turns} == {
         moving.id: None, phantom.id: STOOD}
-    assert none.verdict.reasons[0].startswith('the car stood during all')
+    assert none.verdict.codes[0] == 'E-CAR-STOOD'
     assert found.verdict.level == 'weak'
 
 
@@ -488,7 +489,7 @@ def test_a_camera_in_use_is_compared_with_stored_turns(tmp_path):
         calibrator.push(pictures(1, 640, 360)[0])
         # a single image shows no straight road
         assert judge.moved(calibrator.detection.straights(100), lens) is None
-        with pytest.raises(InputError, match='of another size'):
+        with refused(InputError, 'E-CALIBRATION-SIZE', '320x180'):
             calibrator.detection.resized(replace(lens, image_size=(320, 180)))
 
         def watched(camera):
@@ -643,24 +644,25 @@ def pictures(count: int, width: int, height: int, seed: int | None = None) -> li
                   else rng.integers(0, 256, (height, width), np.uint8)) for n in range(count)]
 
 
-def refused(frames: Iterable[Frame]) -> str:
+def refusal(frames: Iterable[Frame]) -> tuple[str, ...]:
     calibration = calibrated(frames)
     assert calibration.verdict.level == 'refused'
     assert calibration.intrinsics is None and calibration.sigma is None
     assert calibration.verdict.reasons and '\n' not in ''.join(calibration.verdict.reasons)
-    return ' | '.join(calibration.verdict.reasons)
+    return calibration.verdict.codes
 
 
 @pytest.mark.parametrize('image', [np.zeros((64, 96, 3), np.uint8), np.zeros((64, 96), float)])
 def test_a_picture_that_is_not_grey_is_named(image):
-    with limited(Calibrator(QUICK)) as calibrator, pytest.raises(InputError, match='cvtColor'):
+    with (limited(Calibrator(QUICK)) as calibrator,
+          refused(InputError, 'E-FRAME-NOT-GREY', '64x96')):
         calibrator.push(Frame(0, 0, image))
 
 
 @pytest.mark.parametrize('step', [0, 1, 100, 100_000, -100, -100_000_000])
 def test_stamps_in_the_wrong_unit_are_named(step):
     image = np.zeros((64, 96), np.uint8)
-    with limited(Calibrator(QUICK)) as calibrator, pytest.raises(InputError, match='nanoseconds'):
+    with limited(Calibrator(QUICK)) as calibrator, refused(InputError, 'E-STAMP-UNIT'):
         for n in range(20):
             calibrator.push(Frame(n, 1_700_000_000 + n * step, image))
 
@@ -718,18 +720,18 @@ def test_a_folder_is_calibrated_in_one_call(tmp_path):
 
 
 def test_no_image_and_one_image():
-    assert '0 image' in refused([])
-    assert 'only 1 image' in refused(pictures(1, 640, 360, 1))
+    assert refusal([]) == ('E-FEW-IMAGES',)
+    assert refusal(pictures(1, 640, 360, 1)) == ('E-FEW-IMAGES',)
 
 
 def test_black_pictures():
-    assert 'no turn was found' in refused(pictures(80, 320, 180))
+    assert 'E-NO-TURN' in refusal(pictures(80, 320, 180))
 
 
 @pytest.mark.parametrize(('width', 'height'), [(32, 32), (1, 1), (400, 8)])
 def test_tiny_pictures(width, height):
-    refused(pictures(80, width, height))
-    refused(pictures(80, width, height, 1))
+    refusal(pictures(80, width, height))
+    refusal(pictures(80, width, height, 1))
 
 
 def test_sensors_of_a_refused_drive_are_named():
@@ -743,18 +745,18 @@ def test_sensors_of_a_refused_drive_are_named():
 
 
 def test_noise_is_no_drive():
-    refused(pictures(80, 320, 180, 7))
+    refusal(pictures(80, 320, 180, 7))
 
 
 def test_a_picture_that_stands(frames):
-    assert 'no turn was found' in refused(
+    assert 'E-NO-TURN' in refusal(
         Frame(n, n * 10**8, frames[0].image) for n in range(80))
 
 
 def test_a_drive_without_a_turn(drive, frames):
     """It ends before the first turn; test/detect has longer ones."""
     straight = frames[:drive.turn_centers[0] - 9]
-    assert len(straight) > 16 and 'no turn was found' in refused(straight)
+    assert len(straight) > 16 and 'E-NO-TURN' in refusal(straight)
 
 
 def test_a_change_of_size_is_named(frames):
@@ -762,7 +764,7 @@ def test_a_change_of_size_is_named(frames):
         for frame in frames[:3]:
             calibrator.push(frame)
         small = Frame(3, frames[3].stamp_ns, frames[3].image[:180, :320])
-        with pytest.raises(InputError, match='640x360 to 320x180 at frame 3'):
+        with refused(InputError, 'E-IMAGE-SIZE-CHANGES', '640x360', '320x180', 'frame 3'):
             calibrator.push(small)
         # the drive may go on with the old size
         assert calibrator.push(frames[3]).frames == 4
@@ -806,7 +808,7 @@ def test_a_mask_fits_images_that_are_enlarged():
     assert valid[:101].all() and not valid[101:].any()
     # as large as these pictures, once it is enlarged: but it is not theirs
     large = picture.repeat(2, axis=0).repeat(2, axis=1)
-    with Calibrator(mask=mask) as calibrator, pytest.raises(InputError, match='320x120'):
+    with Calibrator(mask=mask) as calibrator, refused(InputError, 'E-MASK-SIZE', '320x120'):
         calibrator.push(Frame(0, 10**9, large))
 
 
