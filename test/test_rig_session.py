@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from made_rig import Mounted, made_paths
+from refused import refused
 from shared_drive import LENS, QUICK, SPEC
 from solving import remembered
 
@@ -19,7 +20,7 @@ from dashcalib_ros.cli import demo
 from dashcalib_ros.cli.program import main
 from dashcalib_ros.cli.rig import write_rig
 from dashcalib_ros.demo import Drive, Mounting, render_to_bag, true_places
-from dashcalib_ros.errors import Notice
+from dashcalib_ros.errors import InputError, Notice
 from dashcalib_ros.formats import load_camera
 from dashcalib_ros.formats.rig import RIG_FORMATS, load_rig
 from dashcalib_ros.input.motion import Samples, SensorStream
@@ -55,6 +56,12 @@ def placed(shared_drive, tmp_path_factory):
             {name: folder / name for name in drives}, config=QUICK,
             motion=SensorStream(speed=Samples(times, speed[:, None])))
     return found, drives, kept
+
+
+@pytest.mark.parametrize(('names', 'base'), [(['front'], None), (['front', 'rear'], 'left')])
+def test_a_rig_needs_two_cameras_and_its_base(names, base):
+    with refused(InputError, 'E-RIG-CAMERAS', base):
+        rig_session.rig_of_drives(dict.fromkeys(names), base)
 
 
 def test_pictures_show_where_a_camera_sits(placed):

@@ -38,9 +38,10 @@ def fused():
 
 def test_what_contradicts_is_named_and_left_out(fused):
     shares = fused.shares
-    for name, code in {'again': 'REPEATED', 'small': 'OTHER-SIZE', 'enlarged': 'OTHER-SETTINGS',
-                       'zoomed': 'OTHER-CAMERA'}.items():
-        assert shares[f'{name}.mp4'].left_out.endswith(f' [E-CLIP-{code}]')
+    for name, code in {'again': 'E-CLIP-REPEATED', 'small': 'E-CLIP-OTHER-SIZE',
+                       'enlarged': 'E-CLIP-OTHER-SETTINGS',
+                       'zoomed': 'E-CLIP-OTHER-CAMERA'}.items():
+        assert shares[f'{name}.mp4'].left_out.endswith(f' [{code}]')
     assert '0.mp4' in shares['again.mp4'].left_out
     assert all(size in shares['small.mp4'].left_out for size in ('640x480', '800x450'))
     assert [shares[f'{n}.mp4'].used for n in range(4)] == [1, 1, 1, 1]

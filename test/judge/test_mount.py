@@ -300,14 +300,18 @@ def test_the_pairs_of_a_long_drive_are_few_and_spread():
     assert steps.max() <= 2.1 * steps.min() and found.stamps_s[-1] > 1900
 
 
+def evidence_of(pairs):
+    return conclude.Evidence(
+        LENS.image_size, 100, (), {}, np.zeros((0, 2)), None, FULL_SIZE, {}, pictures=None,
+        straights=pairs)
+
+
 def test_a_failure_does_not_cost_the_lens(solution, monkeypatch):
     def fails(*arguments):
         raise np.linalg.LinAlgError('Singular matrix')
 
     monkeypatch.setattr(conclude, 'mount_of', fails)
-    evidence = conclude.Evidence(
-        LENS.image_size, 100, (), {}, np.zeros((0, 2)), None, FULL_SIZE, {}, pictures=None,
-        straights=pairs_of(mounted(0, 0, 0), count=2))
+    evidence = evidence_of(pairs_of(mounted(0, 0, 0), count=2))
     found = conclude.conclude(solution, evidence, Config())
     assert found.mount is None and found.camera is not None
 
@@ -350,6 +354,14 @@ def test_a_camera_that_is_moved_during_the_drive_begins_anew(solution, moved):
     np.testing.assert_allclose(turned, [moved[0] - 0.5, moved[1] - 1.0], atol=0.3)
     assert judge.moved(first, LENS) is None
     assert mount_of(first, None, known, 'accepted', None).moved_s is None
+
+
+def test_a_camera_that_is_moved_during_the_drive_is_told(solution):
+    first, then = (pairs_of(mounted(yaw, 1.0, 0.0), count=40, seed=seed)
+                   for seed, yaw in enumerate((0.5, 1.5)))
+    for pairs, codes in ((first, []), (joined(first, then), ['E-CAMERA-MOVED'])):
+        calibration = conclude.conclude(solution, evidence_of(pairs), Config())
+        assert [each.code for each in calibration.warnings] == codes
 
 
 def test_a_camera_that_stays_is_not_said_to_be_moved(solution):

@@ -15,6 +15,7 @@ from towns import town
 from dashcalib_ros.config import VerdictConfig
 from dashcalib_ros.input.motion import Samples, SensorStream
 from dashcalib_ros.input.poses import Poses
+from dashcalib_ros.judge import witnesses
 from dashcalib_ros.judge.verdict import judge
 from dashcalib_ros.judge.witnesses import PACE, clock_of_poses, compare_sensors, fit_to, steps_of
 from dashcalib_ros.solve.start import scene_with
@@ -163,7 +164,7 @@ def test_an_image_that_is_missing_within_a_turn_is_noticed(drive):
             tracks, stamps_ns=tracks.stamps_ns - 100_000_000 * late))
         solution = dataclasses.replace(drive[0], scenes=(scene,))
         said, [line] = asked(drive, gyro(drive, density_deg=0.1), solution=solution)
-        assert said is None and 'they jump within a turn' in line
+        assert said is None and line.code == 'E-GYRO-CLOCK'
 
 
 def jumped(drive, later_s):
@@ -185,6 +186,22 @@ def test_streams_that_do_not_fit_are_told_and_not_used(drive, stream, code, valu
     said, [found] = asked(drive, stream(drive))
     assert said is None and found.code == code
     assert value in found and len(found.splitlines()) == 1
+
+
+def test_a_gyro_that_has_samples_between_turns_only_is_not_used(drive):
+    rate = gyro(drive).rate
+    kept = rate.stamps_s % APART_S > 15.0
+    said, [line] = asked(drive, SensorStream(rate=Samples(rate.stamps_s[kept], rate.values[kept])))
+    assert said is None and line.code == 'E-GYRO-TURNS-LITTLE'
+
+
+def test_sensors_that_cannot_be_compared_cost_themselves_only(drive, monkeypatch):
+    def fails(*arguments):
+        raise np.linalg.LinAlgError('Singular matrix')
+    monkeypatch.setattr(witnesses, 'steps_of', fails)
+    found = compare_sensors(drive[0], gyro(drive), START_S, CONFIG)
+    assert found.solution is drive[0] and found.witnesses.gyro is None
+    assert [each.code for each in found.unused] == ['E-SENSORS-NOT-COMPARED']
 
 
 def test_gaps_leave_out_what_they_hide(drive):
@@ -229,10 +246,19 @@ def test_gps_that_is_an_hour_off_is_named_with_the_hour(drive):
     assert line.code == 'E-GPS-NO-SAMPLES' and ' 1 h ' in line
 
 
-def test_gps_headings_say_nothing_where_the_straights_are_short(drive):
+def test_gps_headings_say_nothing_where_the_straights_are_short(drive, monkeypatch):
     # six metres before and after each turn
     said, [line] = gps(drive, fixes(drive, 0.02))
     assert said is None and line.code == 'E-GPS-NO-STRAIGHTS'
+    monkeypatch.setattr(witnesses, 'STRAIGHT_M', 4.0)
+    said, lines = gps(drive, fixes(drive, 0.02))
+    assert said.agrees and lines == ()
+    # headings that nobody knows, and turns to the other side
+    mirrored = fixes(drive, 0.02).position
+    for stream, code in ((fixes(drive, 1.0), 'E-GPS-HEADINGS'), (SensorStream(position=Samples(
+            mirrored.stamps_s, mirrored.values * (1, -1, 1))), 'E-GPS-OTHER-MOTION')):
+        said, [line] = gps(drive, stream)
+        assert said is None and line.code == code
 
 
 @pytest.mark.parametrize(('later_s', 'words'), [

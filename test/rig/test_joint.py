@@ -88,6 +88,10 @@ def test_a_flat_road_shows_no_height_and_no_metres_without_a_speed():
     found = placed('rear', 'rear/result.json', best, True, 0.0, RigConfig())
     assert found.visible.rotation == ('accepted',) * 3 and found.verdict == 'accepted'
     assert found.translation_m is not None and abs(found.translation_m[2] + 2.0) < 0.05
+    strict = placed('rear', '', best, True, 0.0, RigConfig(rotation_deg=1e-3, clock_s=1e-6))
+    assert strict.verdict == 'refused' and strict.visible.clock == 'not visible'
+    assert {'E-RIG-ROTATION', 'E-RIG-CLOCK'} == {each.code for each in strict.reasons} - {
+        each.code for each in found.reasons}
     best, _ = rig_of(yaws=(85.0, -75.0), metres=None)
     found = placed('rear', 'rear/result.json', best, False, 0.0, RigConfig())
     assert found.translation_m is None and found.verdict == 'accepted'

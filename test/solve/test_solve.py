@@ -28,6 +28,7 @@ from dashcalib_ros.formats import calibrated_camera
 from dashcalib_ros.input.motion import Samples, SensorStream
 from dashcalib_ros.input.scale import FULL_SIZE, Scale
 from dashcalib_ros.judge.agreement import (
+    STOOD,
     focal_disagreement,
     leverages,
     outdated,
@@ -259,7 +260,6 @@ def test_one_turn_s_sigma_allows_for_how_much_turns_differ(no_profile):
     evidence = Evidence(SIZE, 100, (), {}, np.zeros((0, 2)), None, FULL_SIZE, {})
     found = conclude(lone, evidence, CONFIG)
     assert found.verdict.codes[0] == 'E-FEW-TURNS'
-    assert 'nothing confirms' in found.verdict.reasons[0]
     assert solved(scenes_of(2, tracks=100)).sigma[0] < lone.sigma[0]
 
 
@@ -534,6 +534,18 @@ def test_a_field_is_used_from_its_sigma_on(good, share, used):
     assert found.field.rms_px == pytest.approx(share * found.field.sigma_px)
     assert found.field.used == used and ('smooth field' in repr(found)) == used
     assert (calibrated_camera(found).field is not None) == used
+    # its sigma is 1 px
+    assert [each.code for each in found.warnings] == ['E-FIELD-LARGE'] * used
+
+
+def test_what_the_turns_contradict_or_leave_open_is_told(good, monkeypatch):
+    def told(config=CONFIG):
+        return [(each.code, each) for each in conclude(good, evidence_for(good), config).warnings]
+    [(code, line)] = told(CONFIG.replace({'known.fx': '600±5'}))
+    assert code == 'E-KNOWN-CONTRADICTED' and 'known.fx' in line and '600' in line
+    for share, codes in ((0.04, []), (0.3, ['E-PIXELS-SQUARE'])):
+        monkeypatch.setattr(type(good.posterior), 'rival_share', share)
+        assert [code for code, _ in told()] == codes
 
 
 def test_a_model_that_was_asked_for_and_does_not_do_is_told_of(good):
@@ -559,8 +571,9 @@ def test_turns_that_determine_no_camera_are_not_called_dark(good):
     seen = replace(evidence_for(good), frames=500)
     assert conclude(None, seen, CONFIG).verdict.codes == ('E-UNDETERMINED',)
     # all of them are left out
-    dark = replace(seen, left_out=dict.fromkeys(seen.built, 'dark'))
-    assert conclude(None, dark, CONFIG).verdict.codes == ('E-NO-SCENE',)
+    for why, code in (('dark', 'E-NO-SCENE'), (STOOD, 'E-CAR-STOOD')):
+        dark = replace(seen, left_out=dict.fromkeys(seen.built, why))
+        assert conclude(None, dark, CONFIG).verdict.codes == (code,)
 
 
 def test_the_outlook_counts_turns_and_angles_as_the_verdict_does(good):

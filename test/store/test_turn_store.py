@@ -14,10 +14,12 @@ from functools import cache
 
 import numpy as np
 import pytest
+from refused import refused
 from synthetic import LENS, synthetic_turn
 
 from dashcalib_ros.camera import Fisheye
 from dashcalib_ros.detect import TurnId
+from dashcalib_ros.errors import InputError
 from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.reconstruct.scene import Scene, Start
 from dashcalib_ros.solve.start import kinds_of_lenses
@@ -134,7 +136,7 @@ def test_the_home_of_nobody_costs_one_warning(make, tmp_path, monkeypatch):
     hold(store, stored())
     store.clear()
     assert store.turns == {} and list(tmp_path.iterdir()) == []
-    assert len(store.said) == 1 and 'set turns.store' in store.said[0]
+    assert [each.code for each in store.said] == ['E-STORE-HOME']
 
 
 def test_turns_that_are_gone_from_the_bank_are_gone_from_the_folder(make):
@@ -288,6 +290,9 @@ SPOILED = {
     'bomb of another kind': lambda path: bomb(path, zipfile.ZIP_LZMA, 1),
     'boastful': lambda path: boast(path),
 }
+# of what is not even read
+CODES = {'too large': 'E-FILE-TOO-LARGE', 'a link to nothing': 'E-FILE-MISSING', **dict.fromkeys(
+    ('a folder', 'a FIFO', 'a link to a device'), 'E-FILE-NOT-REGULAR')}
 
 
 @pytest.mark.parametrize('kind', SPOILED)
@@ -300,6 +305,8 @@ def test_a_file_of_no_use_is_left_out_with_one_warning(make, kind):
     assert len(found.turns) == 1
     assert [each.code for each in found.said] == ['E-STORE-FILES'] and victim.name in found.said[0]
     assert '\n' not in found.said[0]
+    with refused(InputError, CODES.get(kind, 'E-TURN-FILE'), victim.name):
+        found._read(victim.name)
     # it stays, and is in nobody's way
     hold(found, stored(5), stored(6))
     assert victim.name in names(found) and len(make().turns) == 3
@@ -331,7 +338,7 @@ def test_what_cannot_be_used_is_named(make):
     (store._folder / 'folder.npz').mkdir()
     found = make()
     assert len(found.turns) == 1 and len(found.said) == 1
-    assert found.said[0].startswith('3 files in') and all(
+    assert found.said[0].code == 'E-STORE-FILES' and all(
         name in found.said[0] for name in ('pipe.npz', 'gone.npz', 'folder.npz'))
     hold(found, stored(1))
     assert {'pipe.npz', 'gone.npz', 'folder.npz'} < names(found)
