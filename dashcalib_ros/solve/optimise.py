@@ -107,12 +107,12 @@ class Estimate(steps.State):
     def loss_px(self, least_px: float = 0.0) -> float:
         """Return the scale of the Cauchy loss: intrinsics.loss times the median residual, px.
 
-        Raises Undetermined where no turn is left.
+        Raises Undetermined where no observation is left.
         """
-        if not self.scenes:
-            raise steps.Undetermined('no turn is left')
-        median = float(np.median(np.linalg.norm(
-            np.concatenate([each.off for each in self.seen]), axis=1)))
+        off = np.concatenate([np.zeros((0, 2)), *(each.off for each in self.seen)])
+        if not len(off):
+            raise steps.Undetermined('no observation is left')
+        median = float(np.median(np.linalg.norm(off, axis=1)))
         return max(self.config.intrinsics.loss * median, LEAST_LOSS_PX, least_px)
 
 
