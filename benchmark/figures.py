@@ -249,6 +249,8 @@ NODE = (found(r'camera_info published \| (\d+)'), found(r'received by the node \
         found(r'while it calibrates: median.*?\| ([\d.]+),'), found(r'of one core \| ([\d.]+) %'))
 EXACT = (found(r'\| 0 \| global shutter \|[^|]*\| ([\d.]+); ([\d.]+)'),)
 CLOCKS = (found(r'or not found: (\d+) of (\d+)'),)
+
+
 def without_turns(known: str) -> Source:
     """Return a source: pieces of real drives, those with a number, how far these are off."""
     return found(rf'Real pieces, stabiliser {known}: (\d+) drives, (\d+) numbers, .*?; ([\d.]+) '
@@ -270,13 +272,13 @@ FIGURES = (
            '| @ |', 'spoilt_tracks', (spoilt,)),
     Figure(README, '| # pieces, # with an fx; # sigmas RMS off, # beyond 2; sigma # % in the '
            'median | @ |', 'without_turns', (without_turns('no'),)),
+    Figure(README, '| # of # shifts not within 2 sigma | @ |', 'clocks', CLOCKS),
+    Figure(README, '| # of # images answered, # ms in the median, # % of a core | @ |',
+           'node_latency', NODE),
     Figure(PROOF, '| # pieces, # with an fx: # sigmas RMS off, # beyond 2; sigma # % | @ |',
            'without_turns', (without_turns('no'),)),
     Figure(PROOF, '| # pieces, # with an fx, at best weak: # sigmas RMS off, # beyond 2; sigma # '
            '% | @ |', 'without_turns', (without_turns('not known'),)),
-    Figure(README, '| # of # shifts not within 2 sigma | @ |', 'clocks', CLOCKS),
-    Figure(README, '| # of # images answered, # ms in the median, # % of a core | @ |',
-           'node_latency', NODE),
     Figure(PROOF, '| fx # and # px | @ |', 'node_drive', (
         found(r'fx (\d+\.\d ± \d+\.\d) px', r'(?s)KITTI 03.*?\| fx \| (\d+\.\d)'),
         found(r'with other turns: (\d+\.\d ± \d+\.\d)', r'(?s)KITTI 03.*?reference (\d+\.\d)'))),

@@ -14,10 +14,10 @@ import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from measure import load, parser_with, save
-from result_tables import keep_table
+from measure import commit, keep_table, load, parser_with, save
 
 from dashcalib_ros.camera.rotation import rotation_vectors
 from dashcalib_ros.demo import RIGS, render_to_bag, rig_drives, true_places
@@ -93,20 +93,22 @@ def main() -> None:
     parser.add_argument('--cache', type=Path, default=Path(tempfile.gettempdir()) / 'rigs')
     parser.add_argument('--real', type=Path)
     args = parser.parse_args()
-    path = args.out / 'rig.json'
-    done: dict[str, list[str]] = load(path)
+    path, at = args.out / 'rig.json', commit()
+    done: dict[str, dict[str, Any]] = load(path)
     for kind in args.kinds:
         for seed in args.seeds:
             if (key := f'{kind}-{seed}-{args.turns}') not in done:
-                done[key] = rendered(kind, seed, args.turns, args.cache)
+                rows = rendered(kind, seed, args.turns, args.cache)
+                done[key] = {'commit': at, 'rows': rows}
                 save(path, done)
-                print('\n'.join(done[key]), flush=True)
+                print('\n'.join(rows), flush=True)
     if args.real is not None and args.real.name not in done:
-        done[args.real.name] = real(args.real)
+        done[args.real.name] = {'commit': at, 'rows': real(args.real)}
         save(path, done)
-    rendered_rows = [row for key, rows in done.items() for row in rows if row.startswith('|')]
-    real_lines = [row for rows in done.values() for row in rows if not row.startswith('|')]
-    keep_table('rig', '\n'.join([HEAD, *rendered_rows, *real_lines]), args)
+    # the table first, then what is said of the real pair
+    lines = sorted((row for each in done.values() for row in each['rows']),
+                   key=lambda row: not row.startswith('|'))
+    keep_table('rig', '\n'.join([HEAD, *lines]), args, [each['commit'] for each in done.values()])
 
 
 if __name__ == '__main__':

@@ -25,7 +25,7 @@ import numpy as np
 from attacks import Film, shifted, stepped, swings, warped, with_pictures, zoomed
 from mapping import GRID
 from measure import calibrate as calibrate_frames
-from measure import isolated, keep_table, load, parser_with, save, table
+from measure import commit, isolated, keep_table, load, parser_with, save, table
 from population import closest_cameras, rays_of
 from population import drive_of as camera_and_street
 
@@ -160,11 +160,12 @@ def main() -> None:
     parser.add_argument('--spoilt', nargs='*', choices=SPOILT, default=[], metavar='NAME',
                         help='of ' + ', '.join(SPOILT).replace('%', '%%'))
     args = parser.parse_args()
-    path = args.out / 'without_turns.json'
+    path, at = args.out / 'without_turns.json', commit()
     rows = load(path)
 
     def keep(key: str, row: Mapping[str, Any] | None, failure: str) -> None:
-        rows[key] = {'verdict': 'failed', 'why': failure} if row is None else row
+        rows[key] = {'commit': at} | (
+            {'verdict': 'failed', 'why': failure} if row is None else {**row})
         save(path, rows)
         print(key, rows[key], flush=True)
 
@@ -204,7 +205,7 @@ def main() -> None:
                       if belongs(key) and key.endswith(f'| {known}')]
             if chosen:
                 text += f'\n\n{words}, stabiliser {known}: {honesty(chosen)}'
-    keep_table('without_turns', text, args)
+    keep_table('without_turns', text, args, [row['commit'] for row in kept.values()])
 
 
 if __name__ == '__main__':

@@ -40,7 +40,7 @@ def facade(rng: Random, size_m: tuple[float, float], density: float, light: floa
     """Return a house front.
 
     size_m: width and height. density: texels per metre. light: relative to full sun. grain: a
-    larger picture of fine noise, and use a piece of it.
+    larger picture of fine noise; a piece of it is used.
     """
     width_m, height_m = size_m
     wide, high = max(24, round(width_m * density)), max(24, round(height_m * density))

@@ -42,7 +42,7 @@ def render_parallel(make_renderer: Callable[[], Renderer], first: int, last: int
     Raises WorkerError when a worker dies.
     """
     context = multiprocessing.get_context('spawn')
-    # a pipe, as no event: setting one waits for a worker that died while it waited for it
+    # a pipe, not an event: Event.set() waits for ever for a worker that died in Event.wait()
     stopped, stop = context.Pipe(duplex=False)
     pool = ProcessPoolExecutor(processes, context, _start, (make_renderer, stopped))
     pending: deque[Future[list[Frame]]] = deque()

@@ -125,7 +125,7 @@ def _of_make(unit: Unit, prior: LensPrior | None, others: int, config: FleetConf
 def odds_of_mode(unit: Unit, prior: LensPrior) -> float:
     """Return how much likelier a unit's focal length is in the mode of its make than in another.
 
-    Another mode may have any focal length from half to twice that of the model.
+    Another mode may have any focal length from half to twice that of the make.
     """
     # of the logarithm of the focal length
     slope = -2 * prior.mean[0]
@@ -170,7 +170,7 @@ FOCAL_SPREAD = 0.0125
 
 
 def _densest(focal: Floats, variance: Floats) -> Mask:
-    """Return (n,) the units around the value that most others agree with: the model's main mode.
+    """Return (n,) the units around the value that most others agree with: the make's main mode.
 
     focal: (n,) curvatures; variance: (n,) of each. A unit that knows little counts little.
     """

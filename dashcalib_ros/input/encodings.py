@@ -65,8 +65,8 @@ _FOXGLOVE: Mapping[str, Sequence[tuple[str, int, int]]] = {
 def message_of(kind: str, encoding: str, raw: bytes, schema: bytes = b'') -> Any:
     """Return the message that bytes are.
 
-    kind: its type. encoding: one of ENCODINGS; topics of others are of no type that is read.
-    schema: a bag's own, of protobuf.
+    kind: its type. encoding: one of ENCODINGS; topics with another one are not read. schema: a
+    bag's own, of protobuf.
 
     ROS's messages are read by ROS's own definitions, not the bag's: sensor_msgs' images never
     changed, and a bag with an invalid definition of another type can still be read. Raises nearly

@@ -395,8 +395,7 @@ NO_VALUES = np.empty(0), np.empty((0, 3))
 class SensorBuffer:
     """The newest samples of a bag's or a node's sensors: add() them as they come, stream() to ask.
 
-    Duplicate and late samples are dropped on reading. Memory is bounded: of each kind
-    the newest are kept.
+    stream() drops duplicate and late ones. Memory is bounded: of each kind the newest are kept.
     """
 
     def __init__(self, length: int = 200_000) -> None:

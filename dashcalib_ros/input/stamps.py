@@ -42,7 +42,7 @@ def least_step_ns(rate: float) -> float:
     return (1 - EARLY) * 1e9 / rate
 
 
-# images whose stamps are compared with the times at which they came, and the minimum of them
+# images whose stamps are compared with the times at which they came; minimum number of these
 COMPARED, LEAST_COMPARED = 50, 8
 # how much longer or shorter the time between stamps is, and what a driver then writes as what
 WRONG_UNITS = {1e-9: 'seconds as nanoseconds', 1e-6: 'milliseconds as nanoseconds',

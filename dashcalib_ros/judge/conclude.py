@@ -120,7 +120,8 @@ def evidence_of_detection(detection: Detection, scenes: Iterable[Scene | None] =
 def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> CalibrationData:
     """Return the calibration; a refused one has no intrinsics, so that they cannot be used.
 
-    What is not part of the camera or its verdict may fail alone: that costs a line.
+    Where something fails that is neither the camera nor its verdict, that part is left out, with
+    a warning.
     """
     lost: list[Notice] = []
     scenes = {turn.scene.turn: turn.scene for turn in evidence.stored} | evidence.built

@@ -26,7 +26,7 @@ PICTURE_WIDTH = 720
 # world to camera: rotation (3, 3), translation (3,)
 Pose = tuple[Floats, Floats]
 
-# minimum of a turn; with fewer it is not reconstructed
+# minimum number of keyframes of a turn; with fewer it is not reconstructed
 MIN_KEYFRAMES = 6
 
 

@@ -21,7 +21,7 @@ from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.rig.dense import Retraced, imaging_of, loss_of
 from dashcalib_ros.solve.solution import Solution
 
-# minimum of a scene; with fewer it says nothing about a rig
+# minimum number of poses of a scene; with fewer it says nothing about a rig
 LEAST_POSES = 6
 
 

@@ -56,8 +56,8 @@ class Aligned:
     explained: float
     turned: float
     rival: float
-    stretches: int = 1
-    apart_s: float = 0.0
+    stretches: int
+    apart_s: float
 
     @property
     def found(self) -> bool:

@@ -27,7 +27,8 @@ RATIO, FEATURES = 0.75, 3000
 LOSSES_PX, WRONG_PX = (30.0, 10.0, 3.0, 1.5, 1.0, 1.0, 1.0, 1.0), 3.0
 # columns and rows of the cells over the first picture; matches of a cell, and of a pair of cameras
 CELLS, LEAST_IN_CELL, LEAST_MATCHES = (6, 3), 15, 60
-# share of matches that fit to one rotation where both cameras see the same; by chance 3 % do
+# share of matches that must fit to one rotation: without a common view 23 % did by chance, with a
+# small one 73 % (two pairs of a rendered rig); of a stereo pair 98 %
 LEAST_INSIDE = 0.4
 
 
@@ -80,8 +81,8 @@ def fitted(rays: tuple[Floats, Floats], rotation: Floats, px: float, free: bool 
            ) -> Fitted | None:
     """Return how matches' rays (n, 3) fit to a rotation; free: it is refined, too.
 
-    px: of a radian. None where there are too few matches, or no rotation fits to most of them:
-    cameras that see nothing in common have some by chance.
+    px: of a radian. None where there are too few matches, or, if free, where too small a share of
+    them fits: cameras that see nothing in common have matches by chance.
     """
     first, second = rays
     if len(first) < LEAST_MATCHES:
