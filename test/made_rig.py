@@ -66,7 +66,7 @@ def made_paths(cameras: Mapping[str, Mounted], yaws: Sequence[float] = (85.0, -7
     """Return what cameras know of turns, 40 s apart, and how far each one's lens is off.
 
     turn_deg, move (of a step): noise of poses, of which a half is known. lens_sigma: of three
-    parameters, in units of 0.1 degrees about the vertical, 0.1 about x, and 1 % of the turning.
+    parameters, in units of 0.1 degrees about the vertical, 0.1 about x, and 0.3 % of the turning.
     """
     rng, found, lenses = np.random.default_rng(seed), {}, {}
     for name, mounted in cameras.items():
@@ -105,7 +105,7 @@ def _follow(rotations: np.ndarray, translations: np.ndarray) -> np.ndarray:
         # a centre that is off turns all of them: what is constant in the world is no change
     steps = rotations @ rotations[0].T
     angle = np.unwrap(np.arctan2(steps[:, 0, 2] - steps[:, 2, 0], steps[:, 0, 0] + steps[:, 2, 2]))
-    unit = 0.01 * angle[:, None] * [0.0, 1.0, 0.0]
+    unit = 0.003 * angle[:, None] * [0.0, 1.0, 0.0]
     found[:, :3, 2] = unit
     found[:, 3:, 2] = np.cross(unit, translations)
     return found

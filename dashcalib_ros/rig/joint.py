@@ -8,13 +8,13 @@ mostly the base's, says where it must be at that time:
     rotation = R P(t - o) G,    translation = (R (P(t - o) g + T(t - o)) + l / m) / s
 
 P, T: the base's pose; m: metres in a unit of its scene; G, g, s: the similarity between both
-scenes. The unknowns are each camera's rotation, translation and clock, m, the similarities, and
-each camera's lens, with the covariance that all of its turns give it: poses follow their lens.
-In the end each lens is put back to what its own turns say, which is what is judged and written:
-on rendered rigs the paths move it to no better place. Its covariance stays in that of places.
+scenes. The unknowns are each camera's rotation, translation and clock, m, and the similarities.
+Each lens stays as its own turns say: the rotation that is written belongs to the lens that is
+written. Poses follow their lens, so the covariance of the lenses is part of that of the places.
 
-Beside the scenes' own noise there is what else no model has, at every keyframe, and how the car
-shook between two keyframes of the reference: as large as the residuals say. So cameras with one
+Beside the scenes' own noise there is what else no model has: at every keyframe, between two
+keyframes of the reference, where the car shook, and slowly: the error of a direction of travel
+lasts, that of a rotation adds up. Each is as large as the residuals say. So cameras with one
 trigger gain, and a stretch counts less in which the car shakes.
 """
 from __future__ import annotations
@@ -25,6 +25,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag, solve_triangular
 
 from dashcalib_ros.arrays import Floats, Ints
 from dashcalib_ros.camera.rotation import rotation_matrices
@@ -38,17 +39,20 @@ PLACE, GAUGE = 8, 7
 # one sigma of priors. m: cameras of a car are not farther apart. log: of the metres of a scene's
 # unit, where no speed is known. Of time: quartz clocks differ by less
 REACH_M, UNKNOWN_UNIT, PACE = 2.0, 0.7, 1e-4
-# maximum number of steps of the problem; before some of them the noise is weighed anew
-STEPS, WEIGHED = 30, (3, 6)
+# maximum number of steps of the problem; before which of them broken pairs are left out, and
+# the noise is weighed anew
+STEPS, SIFTED, WEIGHED = 30, 2, (4, 7)
+# degrees RMS, and times the median of a camera's pairs: a pair whose rotations are off by more is
+# broken. Of a rendered rig one was off by 1.1 degrees, the others by 0.15 at most
+BROKEN_DEG, BROKEN = 0.4, 4.0
 # of steps, in sigmas; below it they end
 SETTLED = 0.02
 # s: noise between keyframes is that of knots so far apart, times the square of how far they are
 USUAL_GAP_S = 0.2
 # sigmas: a residual beyond it counts less
 OUTLIER = 3.5
-# of a lens's sigma: by how much each stretch may ask for a lens of its own. What all tracks of a
-# stretch share looks like another lens: on rendered rigs poses alone moved fx by 3 sigmas
-LENSES_DIFFER = 0.5
+# s: how long the error of a direction of travel lasts
+SLOW_S = 1.0
 # of numeric derivatives: rad, m, s, logarithms
 STEP = 1e-6
 
@@ -116,21 +120,26 @@ class Noise:
 
     turn (rad), move: of each keyframe; turn_between, move_between: halfway between two keyframes
     of the reference that are USUAL_GAP_S apart. Moves are in steps of the path between keyframes.
+    turn_slow: of a rotation, which adds up (rad per root of a second); way_slow: of the direction
+    of travel (rad), which lasts SLOW_S.
     """
 
     turn: float = 2e-4
     move: float = 3e-3
     turn_between: float = 1e-3
     move_between: float = 5e-3
+    turn_slow: float = 1e-4
+    way_slow: float = 1e-3
 
     @property
     def sizes(self) -> Floats:
-        """Return (4,) all of them."""
-        return np.array([self.turn, self.move, self.turn_between, self.move_between])
+        """Return (6,) all of them; those that are slow last."""
+        return np.array([self.turn, self.move, self.turn_between, self.move_between,
+                         self.turn_slow, self.way_slow])
 
 
 # smallest and largest sizes, and the factors that are tried
-NOISES = (Noise(2e-5, 2e-4, 2e-5, 2e-4), Noise(2e-2, 0.3, 2e-2, 0.3))
+NOISES = (Noise(2e-5, 2e-4, 2e-5, 2e-4, 1e-6, 2e-5), Noise(2e-2, 0.3, 2e-2, 0.3, 1e-2, 5e-2))
 FACTORS = (4.0, 4.0, 2.0, 1.4)
 
 
@@ -139,22 +148,26 @@ class Rows:
     """The residuals of the pairs of one reference scene, linearised, and what their noise is.
 
     off: (6r,) measured less predicted; jacobian: (6r, m) of the prediction; known: (6r, 6r)
-    covariance by the scenes; spread: (4, 6r) of which Noise's sizes are times.
+    covariance by the scenes; spread: (4, 6r) of which Noise's first sizes are times; slow:
+    (2, 6r, 6r) covariances of its last two, each of size 1.
     """
 
     off: Floats
     jacobian: Floats
     known: Floats
     spread: Floats
+    slow: Floats
 
     def covariance(self, noise: Noise) -> Floats:
         """Return (6r, 6r) the covariance of the residuals."""
-        return np.asarray(self.known + np.diag((noise.sizes**2) @ self.spread**2))
+        fast, slow = np.split(noise.sizes**2, [len(self.spread)])
+        return np.asarray(self.known + np.diag(fast @ self.spread**2)
+                          + np.tensordot(slow, self.slow, 1))
 
     def whitened(self, noise: Noise) -> tuple[Floats, Floats, float]:
         """Return jacobian and off with unit noise, and the log of the noise's size."""
         root = np.linalg.cholesky(self.covariance(noise))
-        both = np.linalg.inv(root) @ np.column_stack([self.jacobian, self.off])
+        both = solve_triangular(root, np.column_stack([self.jacobian, self.off]), lower=True)
         return both[:, :-1], both[:, -1], float(np.log(np.diag(root)).sum())
 
     def without_outliers(self, noise: Noise, step: Floats) -> Rows:
@@ -185,8 +198,7 @@ class Problem:
     """The present state of a rig.
 
     places: of all cameras. units: log of the metres in a unit of each reference scene; unit_known:
-    its prior, value and sigma. lenses: (n,) how far each camera's lens is off its own solution.
-    matched: what else shows rotations.
+    its prior, value and sigma. matched: what else shows rotations.
     """
 
     cameras: Mapping[str, CameraPaths]
@@ -194,7 +206,6 @@ class Problem:
     places: Mapping[str, Place]
     units: Mapping[SceneKey, float]
     unit_known: Mapping[SceneKey, tuple[float, float]]
-    lenses: Mapping[str, Floats]
     pairs: tuple[Pair, ...]
     noise: Noise = Noise()
     matched: tuple[Matched, ...] = ()
@@ -205,15 +216,26 @@ class Problem:
 
     @cached_property
     def where(self) -> dict[BlockKey, slice]:
-        """Return the places of each block among the m unknowns."""
+        """Return the places of each block: those of the m unknowns, then those of the lenses."""
         sizes: list[tuple[BlockKey, int]] = [
             (name, PLACE) for name in self.places if name != self.base]
-        sizes += [(('lens', name), len(value)) for name, value in self.lenses.items()]
         sizes += [(('unit', key), 1) for key in self.units]
         sizes += [(('gauge', n), GAUGE) for n in range(len(self.pairs))]
+        sizes += [(('lens', name), len(self.cameras[name].lens_covariance))
+                  for name in self.places]
         ends = np.cumsum([0, *(size for _, size in sizes)]).tolist()
         return {name: slice(start, end)
                 for (name, _), start, end in zip(sizes, ends[:-1], ends[1:], strict=True)}
+
+    @property
+    def unknowns(self) -> int:
+        """Return m, how many unknowns there are."""
+        return int(min(self.where['lens', name].start for name in self.places))
+
+    @property
+    def count(self) -> int:
+        """Return l, how many there are with the lenses."""
+        return int(max(place.stop for place in self.where.values()))
 
     @property
     def groups(self) -> list[list[int]]:
@@ -267,15 +289,14 @@ class Problem:
         return now.off(pair)
 
     def linearised(self, members: Sequence[int]) -> Rows:
-        """Return the residuals of the pairs of one reference scene."""
-        count = max(place.stop for place in self.where.values())
+        """Return the residuals of the pairs of one reference scene, by unknowns and lenses."""
         key = self.pairs[members[0]].reference
         reference, its_lens = self.scene(key), self.where['lens', key[0]]
-        offs, jacobians, spreads, knots, owns = [], [], [], [], []
+        offs, jacobians, spreads, slows, knots, owns = [], [], [], [], [], []
         for n in members:
             pair = self.pairs[n]
             other, off, by_knots = self.scene(pair.other), self.off(pair), self.by_knots(pair)
-            jacobian = np.zeros((*off.shape, count))
+            jacobian = np.zeros((*off.shape, self.count))
             blocks: tuple[BlockKey, ...] = (
                 key[0], pair.other[0], ('unit', key), ('gauge', n))
             for name in blocks:
@@ -291,26 +312,17 @@ class Problem:
             # poses that were measured follow their lens
             jacobian[:, :, self.where['lens', pair.other[0]]] -= follow
             jacobian[:, :, its_lens] += its_follow
-            off = off + follow @ self.lenses[pair.other[0]] - its_follow @ self.lenses[key[0]]
             offs.append(off.ravel())
-            jacobians.append(jacobian.reshape(off.size, count))
+            jacobians.append(jacobian.reshape(off.size, -1))
             spreads.append(self._spread(pair))
+            slows.append(self._slow(pair))
             knots.append(by_knots.reshape(off.size, -1))
-            owns.append(other.covariance[np.ix_(rows, rows)] + self._own_lens(
-                pair.other, other.follow[rows]))
+            owns.append(other.covariance[np.ix_(rows, rows)])
         together = np.concatenate(knots)
-        known, at = (together @ reference.covariance @ together.T
-                     + self._own_lens(key, together @ reference.follow)), 0
-        for own in owns:
-            known[at:at + len(own), at:at + len(own)] += own
-            at += len(own)
+        known = together @ reference.covariance @ together.T + block_diag(*owns)
         return Rows(np.concatenate(offs), np.concatenate(jacobians), known,
-                    np.concatenate(spreads, axis=1))
-
-    def _own_lens(self, key: SceneKey, follow: Floats) -> Floats:
-        """Return the covariance of poses by what a scene's lens differs from its camera's."""
-        return np.asarray(LENSES_DIFFER**2 * follow @ self.cameras[key[0]].lens_covariance
-                          @ follow.T)
+                    np.concatenate(spreads, axis=1),
+                    np.stack([block_diag(*each) for each in zip(*slows, strict=True)]))
 
     def _spread(self, pair: Pair) -> Floats:
         """Return (4, 6r) of which Noise's sizes are times."""
@@ -326,15 +338,36 @@ class Problem:
         return np.stack([np.outer(size, kind).ravel() for size, kind in (
             (one, turn), (one, move), (between, turn), (between, move))])
 
-    def prior(self) -> tuple[Floats, Floats]:
-        """Return the information (m, m) of all that is known before, and its score (m,)."""
-        count = max(place.stop for place in self.where.values())
-        information, score = np.zeros((count, count)), np.zeros(count)
-        for name, value in self.lenses.items():
+    def _slow(self, pair: Pair) -> Floats:
+        """Return (2, 6r, 6r) the covariances of slow noise of size 1: of rotations, of the way.
+
+        A pose that was measured has all errors until then in its own axes.
+        """
+        path = self.scene(pair.other)
+        rotations = path.trajectory.rotations[pair.rows]
+        seconds, count = path.seconds[pair.rows], len(pair.rows)
+        since = np.einsum('iab,jcb->iajc', rotations, rotations) * np.tri(count)[:, None, :, None]
+        after = np.sqrt(np.diff(seconds, prepend=seconds[0]))
+        centres = path.centres[pair.rows]
+        ways = np.linalg.norm(np.diff(centres, axis=0, prepend=centres[:1]), axis=1)
+        lasts = np.exp(-np.abs(seconds[:, None] - seconds) / SLOW_S)
+        turned = (since * after[:, None]).reshape(3 * count, -1)
+        moved = (since * ways[:, None]).reshape(3 * count, -1)
+        found = np.zeros((2, count, 6, count, 6))
+        found[0, :, :3, :, :3] = (turned @ turned.T).reshape(count, 3, count, 3)
+        found[1, :, 3:, :, 3:] = (moved @ np.kron(lasts, np.eye(3)) @ moved.T).reshape(
+            count, 3, count, 3)
+        return found.reshape(2, 6 * count, 6 * count)
+
+    def prior(self, lenses: bool = False) -> tuple[Floats, Floats]:
+        """Return the information (l, l) of all that is known before, and its score (l,).
+
+        lenses: whether that of each camera's own turns about its lens is part of it.
+        """
+        information, score = np.zeros((self.count, self.count)), np.zeros(self.count)
+        for name in self.places if lenses else ():
             place = self.where['lens', name]
-            inverse = np.linalg.inv(self.cameras[name].lens_covariance)
-            information[place, place] = inverse
-            score[place] = -inverse @ value
+            information[place, place] = np.linalg.inv(self.cameras[name].lens_covariance)
         for key, (known, sigma) in self.unit_known.items():
             place = self.where['unit', key]
             information[place, place] = 1 / sigma**2
@@ -346,8 +379,8 @@ class Problem:
                 information[place, place] = inverse
                 score[place] = -inverse @ [0, 0, 0, *own.translation_m, 0, own.pace]
         for each in self.matched:
-            off, jacobian = self.off_matches(each, count)
-            # lenses are put back in the end: what follows them is no better known than they are
+            off, jacobian = self.off_matches(each)
+            # the lenses stay: what follows them is no better known than they are
             covariance = each.covariance + sum(
                 follow @ self.cameras[name].lens_covariance @ follow.T
                 for name, follow in each.follow.items())
@@ -356,16 +389,16 @@ class Problem:
             score += weighted @ off
         return information, score
 
-    def off_matches(self, found: Matched, count: int) -> tuple[Floats, Floats]:
-        """Return (3,) measured less predicted, and (3, m) derivatives of what is predicted."""
+    def off_matches(self, found: Matched) -> tuple[Floats, Floats]:
+        """Return (3,) measured less predicted, and (3, l) derivatives of what is predicted."""
         across = self.places[found.b].rotation @ self.places[found.a].rotation.T
-        off, jacobian = logarithms((found.rotation @ across.T)[None])[0], np.zeros((3, count))
+        off, jacobian = logarithms((found.rotation @ across.T)[None])[0], np.zeros(
+            (3, self.count))
         for name, turn in ((found.a, -across), (found.b, np.eye(3))):
             if name != self.base:
                 jacobian[:, self.where[name]][:, :3] = turn
             # what was measured follows the lens
             jacobian[:, self.where['lens', name]] = -found.follow[name]
-            off = off + found.follow[name] @ self.lenses[name]
         return off, jacobian
 
     def moved(self, step: Floats) -> Problem:
@@ -376,8 +409,6 @@ class Problem:
                           for name, own in self.places.items()},
             units={key: value + float(step[where['unit', key]][0])
                    for key, value in self.units.items()},
-            lenses={name: value + step[where['lens', name]]
-                    for name, value in self.lenses.items()},
             pairs=tuple(replace(pair, gauge=pair.gauge.moved(step[where['gauge', n]]))
                         for n, pair in enumerate(self.pairs)))
         found.__dict__['where'] = where
@@ -386,15 +417,17 @@ class Problem:
 
 @dataclass(frozen=True)
 class Solved:
-    """The optimum given each camera's own lens. covariance: (m, m); own: by camera, by group.
+    """The optimum given each camera's own lens.
 
-    Of a group these are (PLACE,) how far it is off all, and (PLACE,) its variances.
-    lens_distance: by camera, by how many of its own sigmas paths would move its lens. settled:
-    whether the steps came to an end.
+    covariance: (m, m) if the lenses were known; by_lenses: (m, m) by what they are off. own: by
+    camera, by group: (PLACE,) how far it is off all, and (PLACE,) its variances. lens_distance: by
+    camera, by how many of its own sigmas paths would move its lens. settled: whether the steps
+    came to an end.
     """
 
     problem: Problem
     covariance: Floats
+    by_lenses: Floats
     own: Mapping[str, Sequence[tuple[Floats, Floats]]]
     lens_distance: Mapping[str, float]
     settled: bool = True
@@ -402,7 +435,9 @@ class Solved:
     def sigma(self, name: str) -> Floats:
         """Return (PLACE,) the sigmas of a camera, larger where its stretches differ by more."""
         place = self.problem.where[name]
-        return np.asarray(np.sqrt(np.diag(self.covariance)[place]) * self.disagreement(name))
+        return np.asarray(np.sqrt(
+            np.diag(self.covariance)[place] * self.disagreement(name)**2
+            + np.diag(self.by_lenses)[place]))
 
     def disagreement(self, name: str) -> Floats:
         """Return (PLACE,) by how much stretches differ, over what their sigmas say; 1 or more."""
@@ -419,77 +454,116 @@ def solved(problem: Problem) -> Solved:
     """Return the optimum of a problem near it."""
     settled = False
     for number in range(STEPS):
+        if number == SIFTED:
+            problem = _without_broken(problem)
         groups = [problem.linearised(members) for members in problem.groups]
         if number in WEIGHED:
             problem = replace(problem, noise=_weighed(problem, groups))
-        step, information, _ = _step(problem, groups)
+        found = _normal(problem, groups)
         if number > min(WEIGHED):
-            groups = [rows.without_outliers(problem.noise, step) for rows in groups]
-            step, information, _ = _step(problem, groups)
+            groups = [rows.without_outliers(problem.noise, found.step) for rows in groups]
+            found = _normal(problem, groups)
+        unknowns = slice(problem.unknowns)
+        step, information = found.step, found.information[unknowns, unknowns]
         problem = problem.moved(_shortened(problem, step))
-        settled = bool(number > max(WEIGHED) and step @ information @ step < SETTLED**2)
+        settled = bool(number > max(WEIGHED)
+                       and step[unknowns] @ information @ step[unknowns] < SETTLED**2)
         if settled:
             break
-    prior, _ = problem.prior()
-    covariance = np.asarray(np.linalg.inv(information), np.float64)
+    prior = problem.prior()[0][unknowns, unknowns]
     own: dict[str, list[tuple[Floats, Floats]]] = {
         name: [] for name in problem.places if name != problem.base}
     for members, rows in zip(problem.groups, groups, strict=True):
         jacobian, off, _ = rows.whitened(problem.noise)
+        jacobian, off = jacobian[:, unknowns], off - jacobian @ step
         alone = np.linalg.inv(jacobian.T @ jacobian + prior + 1e-9 * np.diag(
             np.diag(information)))
-        away = alone @ (jacobian.T @ (off - jacobian @ step))
+        away = alone @ (jacobian.T @ off)
         for name in {problem.pairs[n].other[0] for n in members}:
             place = problem.where[name]
             own[name].append((away[place], np.diag(alone)[place]))
-    distances = {name: distance(value, problem.cameras[name].lens_covariance)
-                 for name, value in problem.lenses.items()}
-    return Solved(*_with_own_lenses(problem, covariance), own, distances, settled)
+    return Solved(problem, *_with_lenses(problem, found), own,
+                  _lens_distances(problem, groups), settled)
 
 
-def _with_own_lenses(problem: Problem, covariance: Floats) -> tuple[Problem, Floats]:
-    """Return the optimum where no lens moves, and its covariance (m, m) with those of lenses."""
-    count, where = len(covariance), problem.where
-    step, known = np.zeros(count), np.zeros((count, count))
-    for name, value in problem.lenses.items():
-        place = where['lens', name]
-        step[place], known[place, place] = -value, problem.cameras[name].lens_covariance
-    lens = np.concatenate([np.arange(count)[where['lens', name]] for name in problem.lenses])
-    # how all follows the lenses
-    follow = np.linalg.solve(covariance[np.ix_(lens, lens)], covariance[lens]).T
-    left = covariance - follow @ covariance[lens]
-    return problem.moved(follow @ step[lens]), left + follow @ known[np.ix_(lens, lens)] @ follow.T
+def _without_broken(problem: Problem) -> Problem:
+    """Return a problem without the pairs in which both scenes are not one movement."""
+    off = np.array([np.degrees(np.sqrt(np.mean(np.sum(problem.off(pair)[:, :3]**2, axis=1))))
+                    for pair in problem.pairs])
+    names = np.array([pair.other[0] for pair in problem.pairs])
+    usual = np.array([np.median(off[names == name]) for name in names])
+    kept = off <= np.maximum(BROKEN_DEG, BROKEN * usual)
+    return replace(problem, pairs=tuple(
+        pair for pair, good in zip(problem.pairs, kept, strict=True) if good))
 
 
-def _step(problem: Problem, groups: Sequence[Rows]) -> tuple[Floats, Floats, float]:
-    """Return the step to the optimum (m,), the information (m, m), and the badness of the noise.
+@dataclass(frozen=True)
+class Normal:
+    """The normal equations of all unknowns and the lenses.
 
-    That is twice the log of the restricted likelihood, with its sign changed.
+    information: (l, l); step: (l,) to the optimum, 0 of lenses that are held. badness: of the
+    noise, twice the log of the restricted likelihood with its sign changed.
     """
-    information, score = problem.prior()
+
+    information: Floats
+    step: Floats
+    badness: float
+
+
+def _normal(problem: Problem, groups: Sequence[Rows], lenses: bool = False) -> Normal:
+    """Return the normal equations. lenses: whether these are free, too."""
+    information, score = problem.prior(lenses)
     badness = 0.0
     for rows in groups:
         jacobian, off, log = rows.whitened(problem.noise)
         information = information + jacobian.T @ jacobian
         score = score + jacobian.T @ off
         badness += float(off @ off) + 2 * log
-    scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
-    scaled = information * scale[:, None] * scale + 1e-13 * np.eye(len(scale))
-    step = scale * np.linalg.solve(scaled, scale * score)
+    free = slice(problem.count if lenses else problem.unknowns)
+    scale = 1 / np.sqrt(np.maximum(np.diag(information)[free], 1e-300))
+    scaled = information[free, free] * scale[:, None] * scale + 1e-13 * np.eye(len(scale))
+    step = np.zeros(len(score))
+    step[free] = scale * np.linalg.solve(scaled, scale * score[free])
     badness += float(np.linalg.slogdet(scaled)[1]) - 2 * float(np.log(scale).sum())
-    return step, information, badness - float(score @ step)
+    return Normal(information, step, badness - float(score @ step))
 
 
-def _weighed(problem: Problem, groups: Sequence[Rows]) -> Noise:
-    """Return the sizes of the noise that explain the residuals best."""
-    best = _step(problem, groups)[2]
+def _with_lenses(problem: Problem, found: Normal) -> tuple[Floats, Floats]:
+    """Return the covariances (m, m) of the unknowns: with known lenses, and by the lenses."""
+    free = slice(problem.unknowns)
+    covariance = np.asarray(np.linalg.inv(found.information[free, free]), np.float64)
+    by_lenses = np.zeros_like(covariance)
+    for name in problem.places:
+        follow = covariance @ found.information[free, problem.where['lens', name]]
+        by_lenses += follow @ problem.cameras[name].lens_covariance @ follow.T
+    return covariance, by_lenses
+
+
+def _lens_distances(problem: Problem, groups: Sequence[Rows]) -> dict[str, float]:
+    """Return by how many of its sigmas each lens would move if all were free, and noise as then.
+
+    What lenses held apart leave would pass for noise otherwise.
+    """
+    freed = replace(problem, noise=_weighed(problem, groups, True))
+    step = _normal(freed, groups, True).step
+    return {name: distance(step[problem.where['lens', name]],
+                           problem.cameras[name].lens_covariance) for name in problem.places}
+
+
+def _weighed(problem: Problem, groups: Sequence[Rows], lenses: bool = False) -> Noise:
+    """Return the sizes of the noise that explain the residuals best.
+
+    lenses: whether these are free.
+    """
+    best = _normal(problem, groups, lenses).badness
     sizes, least, most = problem.noise.sizes, *(each.sizes for each in NOISES)
     for factor in FACTORS:
         for place in range(len(sizes)):
             for times in (factor, 1 / factor):
                 tried = sizes.copy()
                 tried[place] = np.clip(times * sizes[place], least[place], most[place])
-                badness = _step(replace(problem, noise=Noise(*tried.tolist())), groups)[2]
+                badness = _normal(
+                    replace(problem, noise=Noise(*tried.tolist())), groups, lenses).badness
                 if badness < best:
                     best, sizes = badness, tried
                     break

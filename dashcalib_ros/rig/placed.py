@@ -150,7 +150,7 @@ def rig_of_paths(alone: Mapping[str, Alone], base: str, turned: Mapping[str, Ali
         if seen.matched:
             best = solved(replace(problem, matched=seen.matched))
             seen = replace(seen, epipolar=witnessed(best, False).epipolar)
-        doubts = {name: (*each, *(apart_doubts(name, best) if name in best.problem.lenses else ()),
+        doubts = {name: (*each, *(apart_doubts(name, best) if name in best.problem.places else ()),
                          *unsettled_doubts(name, best), *seen.doubts.get(name, ()))
                   for name, each in doubts.items()}
     cameras: dict[str, PlacedCamera] = {}
@@ -179,7 +179,7 @@ def lens_doubts(name: str, level: Level) -> tuple[Notice, ...]:
 def apart_doubts(name: str, solved: Solved) -> tuple[Notice, ...]:
     """Return that a rig's paths ask for another lens than a camera's own turns allow, or none."""
     return () if solved.lens_distance[name] <= limit_of(
-        len(solved.problem.lenses[name])) else (Notice(
+        len(solved.problem.cameras[name].lens_covariance)) else (Notice(
             'E-RIG-LENS-APART', f'{name}: the other cameras ask for another lens than its own '
             f'turns show: check that it was not moved during the drive, or drive more turns'),)
 

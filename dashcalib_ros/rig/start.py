@@ -174,9 +174,7 @@ def problem_of(cameras: Mapping[str, CameraPaths], base: str, found: Mapping[str
     used = {name for pair in pairs for name in (pair.reference[0], pair.other[0])} | {base}
     return Problem({name: cameras[name] for name in names if name in used}, base,
                    {name: place for name, place in places.items() if name in used},
-                   {key: value for key, (value, _) in known.items()}, known,
-                   {name: np.zeros(len(cameras[name].lens_covariance)) for name in names
-                    if name in used}, tuple(pairs))
+                   {key: value for key, (value, _) in known.items()}, known, tuple(pairs))
 
 
 def _pair(cameras: Mapping[str, CameraPaths], places: Mapping[str, Place], reference: SceneKey,
