@@ -69,6 +69,7 @@ PARTS = (
     Part('motion', 40, 'a gyro and GPS'),
     Part('clocks', 10, 'clocks of sensors and of poses, shifted'),
     Part('drift', 20, 'a focal length that grows, steps or zooms'),
+    Part('rig', 60, 'several cameras of one car: rendered, halves of real pictures, a real pair'),
     Part('dark', 15, 'turns in dark and wet pictures'),
     Part('mount', 60, 'how the camera sits on the car'),
     Part('moved', 5, 'a camera that is moved within a drive'),

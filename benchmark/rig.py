@@ -2,27 +2,33 @@
 """Rigs with known truth: how far each camera's place is off, in its unit and in sigmas.
 
     python benchmark/rig.py [--kinds KIND ...] [--seeds 0-9] [--turns N] [--cache DIR]
-                            [--real FOLDER] [--results]
+                            [--data DIR] [--drives DRIVE ...] [--results]
 
-Rendered rigs have exact truth; of the real pair (FOLDER has left/ and right/) the epipolar
-geometry of matches that nothing was fitted to is the witness. Rows go to rig.json in --out;
+Rendered rigs have exact truth. The halves of a recorded drive's pictures are two cameras that look
+to the left and to the right, without distortion; their rotation is known, but for what the lens
+is off with which they were cut. Of the real pair kitti_stereo the epipolar geometry of matches
+that nothing was fitted to is the witness. Rows go to rig.json in --out;
 what is there is not run again.
 """
 from __future__ import annotations
 
 import tempfile
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from measure import commit, keep_table, load, parser_with, save
+from scipy.spatial.transform import Rotation
 
+from dashcalib_ros import open_frames
 from dashcalib_ros.camera.rotation import rotation_vectors
 from dashcalib_ros.demo import RIGS, render_to_bag, rig_drives, true_places
 from dashcalib_ros.demo.rig import SPEC
 from dashcalib_ros.input.motion import Samples, SensorStream
+from dashcalib_ros.rig.placed import PlacedCamera
 from dashcalib_ros.rig_session import calibrate_rig
 from dashcalib_ros.workers.worker import prepare_process
 
@@ -30,6 +36,33 @@ HEAD = """\
 | rig | seed | turns | camera | verdict | rotation off, degrees | its sigma | worst, sigmas | \
 lever off, cm (visible axes) | clock off, ms | s |
 |---|---|---|---|---|---|---|---|---|---|---|"""
+
+
+@dataclass(frozen=True)
+class Halved:
+    """A recorded drive and what is cut from it.
+
+    lens: fx, fy, cx, cy, k1, k2. yaw_deg: of both halves; f_px and size: of their pictures.
+    """
+
+    pictures: str
+    fps: float | None
+    lens: tuple[float, float, float, float, float, float]
+    yaw_deg: float
+    f_px: float
+    size: tuple[int, int]
+
+
+HALVES = {
+    'kitti03': Halved('bag', None, (718.2, 718.2, 609.6, 172.9, 0.02, 0.0), 15.0, 680.0,
+                      (560, 300)),
+    'kitti07': Halved('images', 9.65, (701.9, 701.9, 601.9, 183.1, 0.022, 0.0), 15.0, 680.0,
+                      (560, 300)),
+    'kitti_raw': Halved('images', 9.7, (981.5, 981.5, 690.0, 243.0, -0.37, 0.2), 13.0, 900.0,
+                        (720, 420))}
+PAIR = 'kitti_stereo'
+# degrees about x and z, of the left half and of the right one
+TILTS_DEG = ((0.4, 0.3), (-0.5, -0.6))
 
 
 def rendered(kind: str, seed: int, turns: int, cache: Path) -> list[str]:
@@ -50,21 +83,71 @@ def rendered(kind: str, seed: int, turns: int, cache: Path) -> list[str]:
     for name, camera in found.cameras.items():
         if name == base:
             continue
-        start = f'| {kind} | {seed} | {turns} | {name} | {camera.verdict} |'
+        start = f'| {kind} | {seed} | {turns} | {name} |'
         if camera.rotation is None:
-            rows.append(f'{start} {"; ".join(camera.reasons)} | | | | | {seconds:.0f} |')
+            rows.append(unplaced(start, camera, seconds))
             continue
-        off = np.degrees(rotation_vectors((camera.rotation @ truth[name].rotation.T)[None])[0])
-        sigma = np.array(camera.rotation_sigma_deg)
         lever = ''
         if camera.translation_m is not None:
             away = 100 * (np.array(camera.translation_m) - truth[name].translation_m)
             lever = ', '.join(f'{value:.1f}' for value, sight in zip(
                 away, camera.visible.translation, strict=True) if sight != 'not visible')
         clock = 1e3 * ((camera.time_offset_s or 0.0) - truth[name].time_offset_s)
-        rows.append(f'{start} {_text(off)} | {_text(sigma)} | {np.abs(off / sigma).max():.1f} | '
-                    f'{lever} | {clock:.2f} | {seconds:.0f} |')
+        rows.append(f'{rotated(start, camera, truth[name].rotation)} {lever} | {clock:.2f} | '
+                    f'{seconds:.0f} |')
     return rows
+
+
+def unplaced(start: str, camera: PlacedCamera, seconds: float) -> str:
+    """Return the row of a camera without a place."""
+    return f'{start} {camera.verdict} | {"; ".join(camera.reasons)} | | | | | {seconds:.0f} |'
+
+
+def rotated(start: str, camera: PlacedCamera, truth: np.ndarray) -> str:
+    """Return the beginning of a camera's row. truth: (3, 3) from the base's axes."""
+    assert camera.rotation is not None
+    off = np.degrees(rotation_vectors((camera.rotation @ truth.T)[None])[0])
+    sigma = np.array(camera.rotation_sigma_deg)
+    return (f'{start} {camera.verdict} | {_text(off)} | {_text(sigma)} | '
+            f'{np.abs(off / sigma).max():.1f} |')
+
+
+def halves(name: str, data: Path, cache: Path) -> list[str]:
+    """Return the row of the halves of a recorded drive's pictures."""
+    drive, folders, turned = HALVES[name], {}, {}
+    for side, sign, (x, z) in zip(('left', 'right'), (1, -1), TILTS_DEG, strict=True):
+        turned[side] = Rotation.from_rotvec([x, sign * drive.yaw_deg, z], degrees=True).as_matrix()
+        folders[side] = str(cut(name, data, turned[side], cache / f'halves-{name}' / side))
+    started = time.perf_counter()
+    found = calibrate_rig(folders, fps=drive.fps or 10.0).rig
+    seconds = time.perf_counter() - started
+    rows = []
+    for side, camera in found.cameras.items():
+        if side != found.base:
+            start = f'| halves of {name} | | | {side} |'
+            rows.append(unplaced(start, camera, seconds) if camera.rotation is None else
+                        f'{rotated(start, camera, turned[side] @ turned[found.base].T)} | | '
+                        f'{seconds:.0f} |')
+    return rows
+
+
+def cut(name: str, data: Path, turned: np.ndarray, folder: Path) -> Path:
+    """Write the pictures of a camera in the place of a drive's. turned: (3, 3) to its axes."""
+    drive, (width, height) = HALVES[name], HALVES[name].size
+    if folder.exists():
+        return folder
+    fx, fy, cx, cy, k1, k2 = drive.lens
+    x, y = np.meshgrid(np.arange(width), np.arange(height))
+    rays = np.stack([(x - (width - 1) / 2) / drive.f_px, (y - (height - 1) / 2) / drive.f_px,
+                     np.ones(x.shape)], axis=-1).reshape(-1, 3) @ turned
+    pixels = cv2.projectPoints(
+        rays, np.zeros(3), np.zeros(3), np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]),
+        np.array([k1, k2, 0.0, 0.0]))[0].reshape(height, width, 2).astype(np.float32)
+    folder.mkdir(parents=True)
+    for n, frame in enumerate(open_frames(data / name / drive.pictures, fps=drive.fps)):
+        cv2.imwrite(str(folder / f'{n:06d}.png'),
+                    cv2.remap(frame.image, pixels[..., 0], pixels[..., 1], cv2.INTER_LANCZOS4))
+    return folder
 
 
 def real(folder: Path) -> list[str]:
@@ -87,11 +170,11 @@ def _text(values: np.ndarray) -> str:
 
 def main() -> None:
     """Measure, and write the table."""
-    parser = parser_with(__doc__, 'seeds', seeds=[0])
+    parser = parser_with(__doc__, 'data', 'drives', 'seeds', 'cache', drives=[*HALVES, PAIR],
+                         seeds=range(2))
+    parser.set_defaults(cache=Path(tempfile.gettempdir()) / 'rigs')
     parser.add_argument('--kinds', nargs='+', default=list(RIGS))
     parser.add_argument('--turns', type=int, default=3)
-    parser.add_argument('--cache', type=Path, default=Path(tempfile.gettempdir()) / 'rigs')
-    parser.add_argument('--real', type=Path)
     args = parser.parse_args()
     path, at = args.out / 'rig.json', commit()
     done: dict[str, dict[str, Any]] = load(path)
@@ -102,9 +185,13 @@ def main() -> None:
                 done[key] = {'commit': at, 'rows': rows}
                 save(path, done)
                 print('\n'.join(rows), flush=True)
-    if args.real is not None and args.real.name not in done:
-        done[args.real.name] = {'commit': at, 'rows': real(args.real)}
-        save(path, done)
+    for name in args.drives if args.data else ():
+        if name not in done:
+            rows = (real(args.data / name) if name == PAIR else
+                    halves(name, args.data, args.cache))
+            done[name] = {'commit': at, 'rows': rows}
+            save(path, done)
+            print('\n'.join(rows), flush=True)
     # the table first, then what is said of the real pair
     lines = sorted((row for each in done.values() for row in each['rows']),
                    key=lambda row: not row.startswith('|'))
