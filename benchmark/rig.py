@@ -42,24 +42,25 @@ lever off, cm (visible axes) | clock off, ms | s |
 class Halved:
     """A recorded drive and what is cut from it.
 
-    lens: fx, fy, cx, cy, k1, k2. yaw_deg: of both halves; f_px and size: of their pictures.
+    lens: fx, fy, cx, cy, then k1, k2, p1, p2, k3 as far as they are not 0. yaw_deg: of both
+    halves; f_px and size: of their pictures.
     """
 
     pictures: str
     fps: float | None
-    lens: tuple[float, float, float, float, float, float]
+    lens: tuple[float, ...]
     yaw_deg: float
     f_px: float
     size: tuple[int, int]
 
 
 HALVES = {
-    'kitti03': Halved('bag', None, (718.2, 718.2, 609.6, 172.9, 0.02, 0.0), 15.0, 680.0,
+    'kitti03': Halved('bag', None, (718.2, 718.2, 609.6, 172.9, 0.02), 15.0, 680.0,
                       (560, 300)),
-    'kitti07': Halved('images', 9.65, (701.9, 701.9, 601.9, 183.1, 0.022, 0.0), 15.0, 680.0,
+    'kitti07': Halved('images', 9.65, (701.9, 701.9, 601.9, 183.1, 0.022), 15.0, 680.0,
                       (560, 300)),
-    'kitti_raw': Halved('images', 9.7, (981.5, 981.5, 690.0, 243.0, -0.37, 0.2), 13.0, 900.0,
-                        (720, 420))}
+    'kitti_raw': Halved('images', 9.7, (984.24, 980.81, 690.0, 233.2, -0.37288, 0.20373, 0.00222,
+                                        0.00138, -0.07234), 13.0, 900.0, (720, 400))}
 PAIR = 'kitti_stereo'
 # degrees about x and z, of the left half and of the right one
 TILTS_DEG = ((0.4, 0.3), (-0.5, -0.6))
@@ -136,17 +137,18 @@ def cut(name: str, data: Path, turned: np.ndarray, folder: Path) -> Path:
     drive, (width, height) = HALVES[name], HALVES[name].size
     if folder.exists():
         return folder
-    fx, fy, cx, cy, k1, k2 = drive.lens
+    fx, fy, cx, cy, *distortion = drive.lens
     x, y = np.meshgrid(np.arange(width), np.arange(height))
     rays = np.stack([(x - (width - 1) / 2) / drive.f_px, (y - (height - 1) / 2) / drive.f_px,
                      np.ones(x.shape)], axis=-1).reshape(-1, 3) @ turned
     pixels = cv2.projectPoints(
         rays, np.zeros(3), np.zeros(3), np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]),
-        np.array([k1, k2, 0.0, 0.0]))[0].reshape(height, width, 2).astype(np.float32)
+        np.pad(distortion, (0, 5 - len(distortion))))[0]
+    column, row = np.moveaxis(pixels.reshape(height, width, 2).astype(np.float32), -1, 0)
     folder.mkdir(parents=True)
     for n, frame in enumerate(open_frames(data / name / drive.pictures, fps=drive.fps)):
         cv2.imwrite(str(folder / f'{n:06d}.png'),
-                    cv2.remap(frame.image, pixels[..., 0], pixels[..., 1], cv2.INTER_LANCZOS4))
+                    cv2.remap(frame.image, column, row, cv2.INTER_LANCZOS4))
     return folder
 
 
