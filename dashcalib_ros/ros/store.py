@@ -239,8 +239,6 @@ class Store:
             text = (f'{self.path} is not used: {error}; {self._moved_aside()}'
                     if error.code == 'E-KEPT-IMPLAUSIBLE' else f'{self.path} is ignored: {error}')
             raise InputError(error.code, text) from error
-        except (OSError, ValueError, OverflowError) as error:
-            raise InputError('E-KEPT-UNREADABLE', f'{self.path} is ignored: {error}') from error
         if self.given_up:
             raise InputError('E-KEPT-WITHDRAWN', self.given_up)
         self._text = text

@@ -203,6 +203,24 @@ def test_a_file_that_is_none_is_ignored_and_stays(store, text):
     assert mine.path.read_text() == text
 
 
+def test_what_was_withdrawn_is_not_loaded_again_where_it_could_not_be_moved(store, monkeypatch):
+    def full(path):
+        raise OutputError('E-NOT-MOVED', f'cannot move {path}')
+
+    mine = store()
+    mine.save(kept_of())
+    monkeypatch.setattr('dashcalib_ros.ros.store.set_aside', full)
+    with pytest.raises(OutputError):
+        mine.retire()
+    with pytest.raises(InputError) as raised:
+        mine.load()
+    assert raised.value.code == 'E-KEPT-WITHDRAWN'
+    # what somebody writes there since is another one
+    other = kept_of('brown')
+    mine.path.write_text(other.text)
+    assert mine.load().camera.camera == other.camera.camera
+
+
 @pytest.mark.parametrize(('keys', 'value'), [
     (('camera_matrix', 'data', 0), 740.0), (('distortion_coefficients', 'data', 0), -0.3),
     (('dashcalib', 'sigma', 'fx'), 1e-9), (('image_height',), 376),

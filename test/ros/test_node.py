@@ -479,6 +479,7 @@ BAD = (
     ({'turns__half_widht': 3}, 'turns.half_width', 'E-PARAMETER-UNKNOWN'),
     ({'check_only': True}, 'start checker', 'E-CHECK-ONLY-REMOVED'),
     ({'of_another_node': 3}, 'of_another_node', 'E-PARAMETER-UNKNOWN'),
+    (['-r', 'image_raw'], '-r image_raw', 'E-ROS-ARGUMENT-INVALID'),
 )
 # the program as often as there are arguments, one after the other; behind what each wrote to
 # stderr its exit code
@@ -495,7 +496,8 @@ def refusals(tmp_path_factory):
     """Return what one process says to each of the bad parameters, and its exit code."""
     home = tmp_path_factory.mktemp('refusals')
     done = subprocess.run(
-        [sys.executable, '-c', ONE_BY_ONE, json.dumps([pairs(given) for given, *_ in BAD])],
+        [sys.executable, '-c', ONE_BY_ONE, json.dumps(
+            [given if isinstance(given, list) else pairs(given) for given, *_ in BAD])],
         capture_output=True, text=True, env={**os.environ, **ros_environment(home)},
         timeout=SOON + len(BAD))
     texts = done.stderr.split('\0')

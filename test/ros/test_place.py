@@ -263,10 +263,14 @@ def test_frames_that_others_publish_and_rigs_without_metres_get_no_transform(
     assert sum('no static transform' in line for line in desk.endpoints.lines) == 2
 
 
-@pytest.mark.parametrize('names', ['', 'front', 'front front', 'front left front', 'front ../x'])
-def test_names_that_are_no_cameras_are_refused(made, names):
-    with pytest.raises(ConfigError):
+@pytest.mark.parametrize(('names', 'code'), [
+    ('', 'E-RIG-NODE-CAMERAS'), ('front', 'E-RIG-NODE-CAMERAS'),
+    ('front front', 'E-RIG-NODE-CAMERAS'), ('front left front', 'E-RIG-NODE-CAMERAS'),
+    ('front ../x', 'E-CAMERA-NAME')])
+def test_names_that_are_no_cameras_are_refused(made, names, code):
+    with pytest.raises(ConfigError) as raised:
         made(names=names.split(' '))
+    assert raised.value.code == code
 
 
 def test_a_file_of_other_cameras_is_left_alone(made, tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -15,8 +16,10 @@ from sensor_msgs.msg import CompressedImage
 from std_msgs.msg import Header
 from waiting import wait_for
 
+from dashcalib_ros.errors import InputError
 from dashcalib_ros.input.decode import decode, message_size
 from dashcalib_ros.ros import video
+from dashcalib_ros.ros.background import decode_checked
 from dashcalib_ros.ros.video import VideoDecoding
 
 STEP = 10**8
@@ -108,3 +111,11 @@ def test_without_a_key_picture_the_cure_is_of_the_encoder(start_node, make_bench
     camera.connect(node)
     camera.publish(*(packet(number, data) for number, data in encoded(levels())[1:7]))
     node.wait_for('its publisher sent no key frame')
+
+
+def test_an_image_of_another_size_than_its_header_is_refused():
+    found = cv2.imencode('.png', np.zeros((48, 64), np.uint8))[1].tobytes()
+    assert decode_checked(packet(0, found, 'png'), (64, 48)).shape == (48, 64)
+    with pytest.raises(InputError) as raised:
+        decode_checked(packet(0, found, 'png'), (64, 40))
+    assert raised.value.code == 'E-IMAGE-SIZE-NOT-AS-HEADER'
