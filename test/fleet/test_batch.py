@@ -426,6 +426,7 @@ def fleet(folder, rows, worker=None):
     return batch(cameras, str(folder / 'out'), SETTINGS, LocalEngine(3, [worker or Here()]))[1]
 
 
+@pytest.mark.thorough
 def test_the_cameras_of_a_car_are_a_rig(tmp_path, monkeypatch):
     rows = [car(tmp_path, 'front', time=DATE_S), car(tmp_path, 'side', time=DATE_S + 2),
             # of another day, and of a car with one camera

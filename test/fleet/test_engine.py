@@ -55,6 +55,7 @@ def test_child_processes(tmp_path, count):
     assert engine.cpu_s['double'] > 0 and engine.peak_mb > 10
 
 
+@pytest.mark.thorough
 def test_ray(tmp_path, monkeypatch):
     cluster_utils = pytest.importorskip('ray.cluster_utils')
     # as an installed package is there for the cluster's workers

@@ -85,7 +85,7 @@ POPULATION = {
     'k1': lambda camera, share: replace(camera, k1=camera.k1 + share)}
 
 
-@pytest.mark.parametrize('sign', [1, -1])
+@pytest.mark.parametrize('sign', [1, pytest.param(-1, marks=pytest.mark.thorough)])
 @pytest.mark.parametrize('way', POPULATION)
 @pytest.mark.parametrize('noise', ['sharp', 'soft'])
 def test_the_farther_off_the_graver_the_answer(solution, noise, way, sign):

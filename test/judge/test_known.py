@@ -88,6 +88,7 @@ def gentle(config: Config = CONFIG, sharp: bool = False):
                    for world, yaw in enumerate(yaws)], config)
 
 
+@pytest.mark.thorough
 def test_gentle_bends_may_be_a_stabiliser_s_unless_it_is_known_that_there_is_none():
     unknown = gentle()
     assert len(unknown.perhaps_shifted) == 3 and not unknown.crops

@@ -168,6 +168,7 @@ def test_a_fisheye_must_be_better_by_what_only_a_fisheye_can_be(
     assert [each.chosen for each in tried] == [kind is found for kind in kinds]
 
 
+@pytest.mark.thorough
 def test_a_narrow_lens_that_all_turns_took_for_a_fisheye_is_a_pinhole():
     # in the field of a fisheye p1 and p2 become an error of the centre
     extra = (0.003, -0.003, 0.02)

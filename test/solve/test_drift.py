@@ -39,7 +39,7 @@ def zoomed(zooms: Sequence[float]) -> list[Scene]:
     return found
 
 
-@pytest.mark.parametrize('size', [0.02, -0.012])
+@pytest.mark.parametrize('size', [0.02, pytest.param(-0.012, marks=pytest.mark.thorough)])
 def test_a_lens_that_warms_up_is_measured(size):
     solution = solved(warming(size))
     assert solution.drift is not None
@@ -106,12 +106,14 @@ def test_a_lens_that_follows_the_temperature_is_measured_by_kelvin():
     assert 'E-TEMPERATURE-TIMES' in {each.code for each in other.warnings}
 
 
+@pytest.mark.thorough
 def test_what_grows_with_time_and_not_with_the_temperature_has_no_size_per_kelvin():
     found = solved(warming(0.02), temperature=temperature(WARMTH)).drift
     assert found is not None and found.linear and found.of_kelvin is None
     assert solved(warming(0.0), temperature=temperature(WARMTH)).drift is None
 
 
+@pytest.mark.thorough
 def test_a_temperature_that_stays_is_not_followed():
     found = solved(warming(0.02), temperature=temperature([20.0, 20.5, 21.0, 20.5, 20.0])).drift
     assert found is not None and found.of_kelvin is None

@@ -56,7 +56,8 @@ def test_of_the_same_camera_they_help_as_far_as_this_drive_confirms_them():
     np.testing.assert_array_equal(together.camera.params, same.camera.params)
 
 
-@pytest.mark.parametrize(('own', 'by'), [(1, 1.02), (3, 1.05), (1, 1.3)])
+@pytest.mark.parametrize(('own', 'by'), [
+    (1, 1.02), pytest.param(3, 1.05, marks=pytest.mark.thorough), (1, 1.3)])
 def test_a_lens_exchanged_since_is_left_out_or_in_sigma(own, by):
     scenes = mixed(own, longer(by))
     solution = solved(scenes)

@@ -101,7 +101,7 @@ def test_a_crop_is_taken_out_of_the_tracks():
     np.testing.assert_allclose(middle + 1.01 * (moved - middle) + (3.0, -1.0), scene.tracks.xy)
 
 
-@pytest.mark.parametrize('turns', [(0,), (2, 3)])
+@pytest.mark.parametrize('turns', [(0,), pytest.param((2, 3), marks=pytest.mark.thorough)])
 def test_a_zoom_between_turns_is_named(turns):
     scenes = scenes_of(5)
     scenes = [moved([scene], lambda each: zoomed(each, 1.03))[0] if n in turns else scene
@@ -118,6 +118,7 @@ def test_a_zoom_between_turns_is_named(turns):
         zoom for turn, zoom in zooms.items() if turn not in larger)
 
 
+@pytest.mark.thorough
 def test_a_slow_zoom_is_named_in_noise_too():
     scenes = [moved([scene], lambda each, n=n: zoomed(each, 1 + 0.012 * n))[0]
               for n, scene in enumerate(scenes_of(5, noise_px=0.45))]

@@ -23,7 +23,7 @@ DENSE = {'keyframes': 24, 'keyframe_s': 0.15, 'noise_px': 0.1, 'tracks': 120}
 
 
 @pytest.mark.parametrize(('readout_s', 'shaking_deg_s'), [
-    (0.03, 0.0), (-0.02, 0.0), (0.02, 3.0)])
+    pytest.param(0.03, 0.0, marks=pytest.mark.thorough), (-0.02, 0.0), (0.02, 3.0)])
 def test_a_rolling_shutter_is_measured(readout_s, shaking_deg_s):
     found = solved(scenes_of(3, readout_s=readout_s, shaking_deg_s=shaking_deg_s, **DENSE))
     assert found.rolling

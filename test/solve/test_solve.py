@@ -413,7 +413,7 @@ def test_turns_through_different_lenses_are_not_accepted():
 
 
 @pytest.mark.parametrize(('factor', 'least', 'used'), [
-    (0.8, 0.3, 4), (1.1, 0.3, 4), (2.2, 0.6, 3)])
+    (0.8, 0.3, 4), pytest.param(1.1, 0.3, 4, marks=pytest.mark.thorough), (2.2, 0.6, 3)])
 def test_a_turn_of_another_camera_is_not_outvoted_in_silence(no_profile, factor, least, used):
     """The loss ignores it, so it causes no scatter; far enough off, it is dropped even."""
     other, few = replace(LENS, fx=factor * LENS.fx, fy=factor * LENS.fx), {
