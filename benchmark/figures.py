@@ -257,6 +257,11 @@ def without_turns(known: str) -> Source:
                  r'sigmas RMS, (\d+) beyond 2, \d+ beyond 3; sigma ([\d.]+) %')
 
 
+RIG = (found(r'Rendered: (\d+) cameras, (\d+) placed, (\d+) accepted; the worst ([\d.]+) sigmas '
+             r'off; sigma about the worst axis ([\d.]+)°'),
+       *(found(rf'halves of {name} .*\| ([\d.]+) \| \| \|') for name in ('kitti07', 'kitti_raw')))
+
+
 FIGURES = (
     Figure(README, '# of # sound lenses and # of # behind glass accepted, # wrong; # % of the '
            'parameters within 1 sigma, # % within 2 | @ |', 'population', POPULATION),
@@ -273,6 +278,9 @@ FIGURES = (
     Figure(README, '| # pieces, # with an fx; # sigmas RMS off, # beyond 2; sigma # % in the '
            'median | @ |', 'without_turns', (without_turns('no'),)),
     Figure(README, '| # of # shifts not within 2 sigma | @ |', 'clocks', CLOCKS),
+    Figure(README, '| # cameras, # placed, # accepted after three turns; the worst # sigmas off; '
+           'sigma #° in the median. Halves of real pictures, weak: # and # sigmas off | @ |',
+           'rig', RIG),
     Figure(README, '| # of # images answered, # ms in the median, # % of a core | @ |',
            'node_latency', NODE),
     Figure(PROOF, '| # pieces, # with an fx: # sigmas RMS off, # beyond 2; sigma # % | @ |',

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -170,6 +171,18 @@ def _text(values: np.ndarray) -> str:
     return ', '.join(f'{value:.3f}' for value in values)
 
 
+def summary(rows: Sequence[str]) -> str:
+    """Return one line about the cameras of rendered rigs."""
+    cells = [[cell.strip() for cell in row.split('|')[1:-1]] for row in rows
+             if row.startswith('|') and 'halves' not in row]
+    placed = [row for row in cells if row[7]]
+    sigmas = [max(map(float, row[6].split(','))) for row in placed]
+    return (f'Rendered: {len(cells)} cameras, {len(placed)} placed, '
+            f'{sum(row[4] == "accepted" for row in placed)} accepted; the worst '
+            f'{max(float(row[7]) for row in placed)} sigmas off; sigma about the worst axis '
+            f'{np.median(sigmas):.3f}° in the median.')
+
+
 def main() -> None:
     """Measure, and write the table."""
     parser = parser_with(__doc__, 'data', 'drives', 'seeds', 'cache', drives=[*HALVES, PAIR],
@@ -197,7 +210,8 @@ def main() -> None:
     # the table first, then what is said of the real pair
     lines = sorted((row for each in done.values() for row in each['rows']),
                    key=lambda row: not row.startswith('|'))
-    keep_table('rig', '\n'.join([HEAD, *lines]), args, [each['commit'] for each in done.values()])
+    keep_table('rig', '\n'.join([HEAD, *lines, '', summary(lines)]), args,
+               [each['commit'] for each in done.values()])
 
 
 if __name__ == '__main__':
