@@ -203,7 +203,8 @@ def broken_limits(bench: Recorder, log: str, sent: Sequence[int], memory: Sequen
 def report(bench: Recorder, log: str, sent: list[int], restarts: int, memory: list[float],
            share: float) -> str:
     """Return the table, and what the node said, numbers aside."""
-    due = [stamp for stamp in sent if bench.stamps and stamp >= min(bench.stamps)]
+    first_answered = min(bench.stamps, default=float('inf'))
+    due = [stamp for stamp in sent if stamp >= first_answered]
     values = bench.values
     lines = ['| | |', '|---|---|',
              f'| images sent, received by the node | {len(sent)}, {values["received"]} |',

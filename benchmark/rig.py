@@ -22,11 +22,11 @@ from typing import Any
 import cv2
 import numpy as np
 from measure import commit, keep_table, load, parser_with, save
-from scipy.spatial.transform import Rotation
+from views import View, Viewed
 
 from dashcalib_ros import open_frames
-from dashcalib_ros.camera.rotation import rotation_vectors
-from dashcalib_ros.demo import RIGS, render_to_bag, rig_drives, true_places
+from dashcalib_ros.camera.rotation import rotation_matrices, rotation_vectors
+from dashcalib_ros.demo import RIGS, Lens, render_to_bag, rig_drives, true_places
 from dashcalib_ros.demo.rig import SPEC
 from dashcalib_ros.input.motion import Samples, SensorStream
 from dashcalib_ros.rig.placed import PlacedCamera
@@ -43,25 +43,24 @@ lever off, cm (visible axes) | clock off, ms | s |
 class Halved:
     """A recorded drive and what is cut from it.
 
-    lens: fx, fy, cx, cy, then k1, k2, p1, p2, k3 as far as they are not 0. yaw_deg: of both
-    halves; f_px and size: of their pictures.
+    own: the drive's lens; lens: of both halves; yaw_deg: by which they look to the side.
     """
 
     pictures: str
     fps: float | None
-    lens: tuple[float, ...]
+    own: Lens
+    lens: Lens
     yaw_deg: float
-    f_px: float
-    size: tuple[int, int]
 
 
 HALVES = {
-    'kitti03': Halved('bag', None, (718.2, 718.2, 609.6, 172.9, 0.02), 15.0, 680.0,
-                      (560, 300)),
-    'kitti07': Halved('images', 9.65, (701.9, 701.9, 601.9, 183.1, 0.022), 15.0, 680.0,
-                      (560, 300)),
-    'kitti_raw': Halved('images', 9.7, (984.24, 980.81, 690.0, 233.2, -0.37288, 0.20373, 0.00222,
-                                        0.00138, -0.07234), 13.0, 900.0, (720, 400))}
+    'kitti03': Halved('bag', None, Lens(1242, 375, 718.2, 718.2, 609.6, 172.9, 0.02),
+                      Lens(540, 280, 680.0, 680.0, 269.5, 139.5), 15.0),
+    'kitti07': Halved('images', 9.65, Lens(1226, 370, 701.9, 701.9, 601.9, 183.1, 0.022),
+                      Lens(560, 300, 680.0, 680.0, 279.5, 149.5), 15.0),
+    'kitti_raw': Halved('images', 9.7, Lens(
+        1392, 512, 984.24, 980.81, 690.0, 233.2, -0.37288, 0.20373, 0.00222, 0.00138, -0.07234),
+                        Lens(720, 400, 900.0, 900.0, 359.5, 199.5), 13.0)}
 PAIR = 'kitti_stereo'
 # degrees about x and z, of the left half and of the right one
 TILTS_DEG = ((0.4, 0.3), (-0.5, -0.6))
@@ -118,8 +117,10 @@ def halves(name: str, data: Path, cache: Path) -> list[str]:
     """Return the row of the halves of a recorded drive's pictures."""
     drive, folders, turned = HALVES[name], {}, {}
     for side, sign, (x, z) in zip(('left', 'right'), (1, -1), TILTS_DEG, strict=True):
-        turned[side] = Rotation.from_rotvec([x, sign * drive.yaw_deg, z], degrees=True).as_matrix()
-        folders[side] = str(cut(name, data, turned[side], cache / f'halves-{name}' / side))
+        view = View(f'{name}, {side}', drive.lens, turned_deg=(x, sign * drive.yaw_deg, z))
+        turned[side] = rotation_matrices(np.radians([view.turned_deg]))[0]
+        frames = open_frames(data / name / drive.pictures, fps=drive.fps)
+        folders[side] = cut(Viewed(view, frames, drive.own), cache / f'halves-{name}' / side)
     started = time.perf_counter()
     found = calibrate_rig(folders, fps=drive.fps or 10.0).rig
     seconds = time.perf_counter() - started
@@ -133,24 +134,13 @@ def halves(name: str, data: Path, cache: Path) -> list[str]:
     return rows
 
 
-def cut(name: str, data: Path, turned: np.ndarray, folder: Path) -> Path:
-    """Write the pictures of a camera in the place of a drive's. turned: (3, 3) to its axes."""
-    drive, (width, height) = HALVES[name], HALVES[name].size
-    if folder.exists():
-        return folder
-    fx, fy, cx, cy, *distortion = drive.lens
-    x, y = np.meshgrid(np.arange(width), np.arange(height))
-    rays = np.stack([(x - (width - 1) / 2) / drive.f_px, (y - (height - 1) / 2) / drive.f_px,
-                     np.ones(x.shape)], axis=-1).reshape(-1, 3) @ turned
-    pixels = cv2.projectPoints(
-        rays, np.zeros(3), np.zeros(3), np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]),
-        np.pad(distortion, (0, 5 - len(distortion))))[0]
-    column, row = np.moveaxis(pixels.reshape(height, width, 2).astype(np.float32), -1, 0)
-    folder.mkdir(parents=True)
-    for n, frame in enumerate(open_frames(data / name / drive.pictures, fps=drive.fps)):
-        cv2.imwrite(str(folder / f'{n:06d}.png'),
-                    cv2.remap(frame.image, column, row, cv2.INTER_LANCZOS4))
-    return folder
+def cut(pictures: Viewed, folder: Path) -> str:
+    """Write pictures into a folder, unless it is there; return its path."""
+    if not folder.exists():
+        folder.mkdir(parents=True)
+        for frame in pictures:
+            cv2.imwrite(str(folder / f'{frame.index:06d}.png'), frame.image)
+    return str(folder)
 
 
 def real(folder: Path) -> list[str]:

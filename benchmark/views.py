@@ -20,6 +20,7 @@ import numpy.typing as npt
 from drives import BY_NAME, drive_of, pictures_of
 
 from dashcalib_ros import open_frames
+from dashcalib_ros.camera.rotation import rotation_matrices
 from dashcalib_ros.demo import Lens
 from dashcalib_ros.demo.drive import AnyLens
 from dashcalib_ros.input import Frame
@@ -31,16 +32,17 @@ Grey = npt.NDArray[np.uint8]
 class View:
     """What becomes of each picture.
 
-    lens: of the camera that looks in the same direction from the same place; None: the drive's
-    own. extra: its p1, p2, k3. mirrored: left is right, before that. shrink: so many pixels in a
-    row, and as many rows, become the mean of them, before that. light: the grey values are
-    multiplied by it. noise: added, in grey values; blur: sigma, px; jpeg_quality: 0 for none.
-    frames: the first one and the one after the last.
+    lens: of the camera in the same place; None: the drive's own. extra: its p1, p2, k3.
+    turned_deg: the rotation vector from the drive's camera to that one's axes. mirrored: left is
+    right, before that. shrink: so many pixels in a row, and as many rows, become the mean of them,
+    before that. light: the grey values are multiplied by it. noise: added, in grey values; blur:
+    sigma, px; jpeg_quality: 0 for none. frames: the first one and the one after the last.
     """
 
     name: str
     lens: Lens | None = None
     extra: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    turned_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     mirrored: bool = False
     shrink: int = 1
     light: float = 1.0
@@ -96,7 +98,7 @@ SMALL = {f'{name}, 1/{shrink}': (name, shrink)
 
 @dataclass(frozen=True)
 class Viewed:
-    """A drive through a view: iterable over its frames. own: the drive's lens, undistorted."""
+    """A drive through a view: iterable over its frames. own: the drive's lens."""
 
     view: View
     frames: Iterable[Frame]
@@ -142,10 +144,12 @@ class Viewed:
         rays = cv2.undistortPoints(
             grid.reshape(-1, 1, 2).astype(np.float64), lens.matrix, distortion,
             criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12))
-        x, y = np.moveaxis(rays.reshape(lens.height, lens.width, 2), -1, 0)
-        column, row = own.fx * x + own.cx, own.fy * y + own.cy
-        outside = ((column < -0.5) | (column > own.width - 0.5)
-                   | (row < -0.5) | (row > own.height - 0.5)).mean()
+        turned = rotation_matrices(np.radians([self.view.turned_deg]))[0]
+        column, row = own.project(cv2.convertPointsToHomogeneous(rays)[:, 0] @ turned).T.reshape(
+            2, lens.height, lens.width)
+        inside = ((column >= -0.5) & (column <= own.width - 0.5)
+                  & (row >= -0.5) & (row <= own.height - 0.5))
+        outside = 1 - inside.mean()
         if outside > 0.002:
             raise ValueError(f'{self.view.name}: {100 * outside:.1f} % lie outside the pictures')
         return column.astype(np.float32), row.astype(np.float32)

@@ -147,9 +147,9 @@ FACTORS = (4.0, 4.0, 2.0, 1.4)
 class Rows:
     """The residuals of the pairs of one reference scene, linearised, and what their noise is.
 
-    off: (6r,) measured less predicted; jacobian: (6r, m) of the prediction; known: (6r, 6r)
-    covariance by the scenes; spread: (4, 6r) of which Noise's first sizes are times; slow:
-    (2, 6r, 6r) covariances of its last two, each of size 1.
+    off: (6r,) measured less predicted; jacobian: (6r, l) of the prediction, by the unknowns and
+    the lenses; known: (6r, 6r) covariance by the scenes; spread: (4, 6r) of which Noise's first
+    sizes are times; slow: (2, 6r, 6r) covariances of its last two, each of size 1.
     """
 
     off: Floats
@@ -487,7 +487,7 @@ def solved(problem: Problem) -> Solved:
 
 
 def _without_broken(problem: Problem) -> Problem:
-    """Return a problem without the pairs in which both scenes are not one movement."""
+    """Return a problem without the pairs whose two scenes turn differently: one is broken."""
     off = np.array([np.degrees(np.sqrt(np.mean(np.sum(problem.off(pair)[:, :3]**2, axis=1))))
                     for pair in problem.pairs])
     names = np.array([pair.other[0] for pair in problem.pairs])
