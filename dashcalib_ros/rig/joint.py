@@ -45,6 +45,9 @@ STEPS, SIFTED, WEIGHED = 30, 2, (4, 7)
 # degrees RMS, and times the median of a camera's pairs: a pair whose rotations are off by more is
 # broken. Of a rendered rig one was off by 1.1 degrees, the others by 0.15 at most
 BROKEN_DEG, BROKEN = 0.4, 4.0
+# sigmas, and degrees, of the rotation by which a camera jumps within a stretch: of made rigs that
+# stay as they are 5.0 and 0.18 at most, of those with a bump of 0.3 degrees 7.9 and 0.25 at least
+JUMP, JUMP_DEG = 6.5, 0.2
 # of steps, in sigmas; below it they end
 SETTLED = 0.02
 # s: noise between keyframes is that of knots so far apart, times the square of how far they are
@@ -198,7 +201,7 @@ class Problem:
     """The present state of a rig.
 
     places: of all cameras. units: log of the metres in a unit of each reference scene; unit_known:
-    its prior, value and sigma. matched: what else shows rotations.
+    its prior, value and sigma. matched: what else shows rotations. broken: the pairs left out.
     """
 
     cameras: Mapping[str, CameraPaths]
@@ -209,6 +212,7 @@ class Problem:
     pairs: tuple[Pair, ...]
     noise: Noise = Noise()
     matched: tuple[Matched, ...] = ()
+    broken: tuple[Pair, ...] = ()
 
     def scene(self, key: SceneKey) -> ScenePath:
         """Return a scene by its camera and number."""
@@ -421,8 +425,8 @@ class Solved:
 
     covariance: (m, m) if the lenses were known; by_lenses: (m, m) by what they are off. own: by
     camera, by group: (PLACE,) how far it is off all, and (PLACE,) its variances. lens_distance: by
-    camera, by how many of its own sigmas paths would move its lens. settled: whether the steps
-    came to an end.
+    camera, by how many of its own sigmas paths would move its lens. jumped: the cameras that turn
+    against the base within a stretch. settled: whether the steps came to an end.
     """
 
     problem: Problem
@@ -430,6 +434,7 @@ class Solved:
     by_lenses: Floats
     own: Mapping[str, Sequence[tuple[Floats, Floats]]]
     lens_distance: Mapping[str, float]
+    jumped: frozenset[str] = frozenset()
     settled: bool = True
 
     def sigma(self, name: str) -> Floats:
@@ -482,8 +487,8 @@ def solved(problem: Problem) -> Solved:
         for name in {problem.pairs[n].other[0] for n in members}:
             place = problem.where[name]
             own[name].append((away[place], np.diag(alone)[place]))
-    return Solved(problem, *_with_lenses(problem, found), own,
-                  _lens_distances(problem, groups), settled)
+    return Solved(problem, *_with_lenses(problem, found), own, _lens_distances(problem, groups),
+                  _jumped(problem), settled)
 
 
 def _without_broken(problem: Problem) -> Problem:
@@ -492,9 +497,66 @@ def _without_broken(problem: Problem) -> Problem:
                     for pair in problem.pairs])
     names = np.array([pair.other[0] for pair in problem.pairs])
     usual = np.array([np.median(off[names == name]) for name in names])
-    kept = off <= np.maximum(BROKEN_DEG, BROKEN * usual)
-    return replace(problem, pairs=tuple(
-        pair for pair, good in zip(problem.pairs, kept, strict=True) if good))
+    sound = off <= np.maximum(BROKEN_DEG, BROKEN * usual)
+    kept, broken = (tuple(pair for pair, good in zip(problem.pairs, sound, strict=True)
+                          if good == which) for which in (True, False))
+    return replace(problem, pairs=kept, broken=broken)
+
+
+def _jumped(problem: Problem) -> frozenset[str]:
+    """Return the cameras whose rotation against the base jumps within a stretch.
+
+    Or whose last pair is broken: after others, later ones show where the camera sits.
+    """
+    groups = [problem.linearised(members) for members in problem.groups]
+    normal = _normal(problem, groups)
+    found = {problem.pairs[n].other[0]
+             for members, rows in zip(problem.groups, groups, strict=True)
+             for n, jumps in zip(members, _jumps(problem, members, rows, normal), strict=True)
+             if jumps}
+    for pair in problem.broken:
+        later = [each for each in problem.pairs if each.other[0] == pair.other[0]
+                 and problem.when(each)[-1] > problem.when(pair)[-1]]
+        found |= set() if later else {pair.other[0]}
+    return frozenset(found)
+
+
+def _jumps(problem: Problem, members: Sequence[int], rows: Rows, normal: Normal) -> list[bool]:
+    """Return whether the camera jumps within each of the pairs of one reference scene.
+
+    A score test: how much a rotation of the camera from one of its keyframes on would explain. Of
+    the first and last keyframe alone that is an error of the path's end.
+    """
+    unknowns = slice(problem.unknowns)
+    covariance = np.linalg.inv(normal.information[unknowns, unknowns])
+    root = np.linalg.cholesky(rows.covariance(problem.noise))
+    known, off = (solve_triangular(root, each, lower=True) for each in (
+        rows.jacobian[:, unknowns],
+        rows.off - rows.jacobian[:, unknowns] @ normal.step[unknowns]))
+    found, start = [], 0
+    for n in members:
+        pair = problem.pairs[n]
+        count = len(pair.rows)
+        turned = np.zeros((count, 6, 3))
+        turned[:, :3] = np.eye(3)
+        turned[:, 3:] = -cross(problem.scene(pair.other).trajectory.translations[pair.rows])
+        later = np.tri(count)[:, 1:, None, None] * turned[:, None]
+        columns = np.zeros((len(off), count - 1, 3))
+        columns[start:start + 6 * count] = later.transpose(0, 2, 1, 3).reshape(
+            6 * count, count - 1, 3)
+        start += 6 * count
+        white = solve_triangular(root, columns.reshape(len(off), -1), lower=True)
+        score = (white.T @ off).reshape(count - 1, 3)
+        by_known = (white.T @ known).reshape(count - 1, 3, -1)
+        white = white.reshape(len(off), count - 1, 3)
+        information = (np.einsum('rka,rkb->kab', white, white)
+                       - by_known @ covariance @ by_known.transpose(0, 2, 1))
+        jump = np.linalg.solve(information, score[..., None])[..., 0]
+        gains = np.sum(jump * score, axis=1)
+        best = 1 + int(np.argmax(gains[1:-1]))
+        found.append(bool(gains[best] > JUMP**2
+                          and np.degrees(np.linalg.norm(jump[best])) > JUMP_DEG))
+    return found
 
 
 @dataclass(frozen=True)

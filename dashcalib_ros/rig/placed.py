@@ -151,7 +151,8 @@ def rig_of_paths(alone: Mapping[str, Alone], base: str, turned: Mapping[str, Ali
             best = solved(replace(problem, matched=seen.matched))
             seen = replace(seen, epipolar=witnessed(best, False).epipolar)
         doubts = {name: (*each, *(apart_doubts(name, best) if name in best.problem.places else ()),
-                         *unsettled_doubts(name, best), *seen.doubts.get(name, ()))
+                         *jump_doubts(name, best), *unsettled_doubts(name, best),
+                         *seen.doubts.get(name, ()))
                   for name, each in doubts.items()}
     cameras: dict[str, PlacedCamera] = {}
     for name, own in alone.items():
@@ -182,6 +183,13 @@ def apart_doubts(name: str, solved: Solved) -> tuple[Notice, ...]:
         len(solved.problem.cameras[name].lens_covariance)) else (Notice(
             'E-RIG-LENS-APART', f'{name}: the other cameras ask for another lens than its own '
             f'turns show: check that it was not moved during the drive, or drive more turns'),)
+
+
+def jump_doubts(name: str, solved: Solved) -> tuple[Notice, ...]:
+    """Return that a camera turned against the base within a stretch, or none."""
+    return () if name not in solved.jumped else (Notice(
+        'E-RIG-JUMP', f'{name}: within a turn it jumps against {solved.problem.base}: check that '
+        f'both are fixed to the car, and calibrate the rig from a drive after that'),)
 
 
 def unsettled_doubts(name: str, solved: Solved) -> tuple[Notice, ...]:
