@@ -354,7 +354,8 @@ def drifting(found: Estimate, temperature: Samples | None = None) -> tuple[Drift
     time, unless that explains it clearly better.
 
     And the RMS change over the turns, of fx, that the evidence does not exclude where it is None:
-    a mean over a steady lens and all ways and sizes.
+    a mean over a steady lens and all ways and sizes. Each turn counts by what it knows of fx: the
+    result is not that of one which knows little.
     """
     own_ns = [scene.tracks.stamps_ns for scene in found.scenes if scene.turn.of_this_drive]
     turns = sorted((int(stamps.min()), int(stamps.max())) for stamps in own_ns)
@@ -372,12 +373,16 @@ def drifting(found: Estimate, temperature: Samples | None = None) -> tuple[Drift
     now = found.with_tracks(FIRST_TRACKS).having(asked)
     loss_px = now.loss_px()
     unit = now.noise(loss_px).variance * now.inflation
-    total = Quadratic.together([normal_equations(each, unit).cost.at_noise(unit)
-                                for each in now.linear(loss_px)])
+    costs = [normal_equations(each, unit).cost.at_noise(unit) for each in now.linear(loss_px)]
+    total = Quadratic.together(costs)
     places = np.arange(len(total.score))
     own = places[now.imaging.places[Drift.name]]
 
-    middles_ns = np.mean(turns, axis=1).astype(np.int64)
+    middles_ns = np.array([stamps.mean() for stamps in own_ns]).astype(np.int64)
+    steady, known = np.setdiff1d(places, own), now.imaging.prior()
+    weights = np.array([
+        1 / Quadratic.together([cost.of(steady), known.of(steady)]).covariance[0, 0]
+        for cost, scene in zip(costs, now.scenes, strict=True) if scene.turn.of_this_drive])
     unnamed: list[tuple[float, float]] = []
 
     def likeliest_of(ways: Drift, kept: Ints) -> tuple[float, Drift]:
@@ -386,7 +391,7 @@ def drifting(found: Estimate, temperature: Samples | None = None) -> tuple[Drift
         sized = [replace(ways, sigma=size) for size in (STEADY, *DRIFTS)]
         none, *nats = (evidence(cost, now.imaging.having(each), each) for each in sized)
         if ways.size == 1:
-            spread = float(np.var(ways.grown_at(middles_ns)))
+            spread = float(np.cov(ways.grown_at(middles_ns)[:, 0], aweights=weights, ddof=0))
             unnamed.extend((more - none, spread * _mean_square(cost, now.imaging.having(each)))
                            for more, each in zip(nats, sized[1:], strict=True))
         return max(nats) - none, sized[1 + int(np.argmax(nats))]

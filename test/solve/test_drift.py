@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from solving import CONFIG, scenes_of, solved
-from synthetic import LENS, SIZE
+from solving import CONFIG, START, scenes_of, solved
+from synthetic import LENS, SIZE, synthetic_turn
 
 from dashcalib_ros.input.motion import Samples
 from dashcalib_ros.input.scale import FULL_SIZE
@@ -29,9 +29,9 @@ def warming(size: float, count: int = 5) -> list[Scene]:
     return zoomed([1 + size * (n / (count - 1) - 0.5) for n in range(count)])
 
 
-def zoomed(zooms: Sequence[float]) -> list[Scene]:
+def zoomed(zooms: Sequence[float], scenes: Sequence[Scene] = ()) -> list[Scene]:
     """Return turns, a minute apart, whose pictures are so many times as large."""
-    scenes, found = scenes_of(len(zooms), tracks=150), []
+    scenes, found = scenes or scenes_of(len(zooms), tracks=150), []
     for n, (scene, zoom) in enumerate(zip(scenes, zooms, strict=True)):
         tracks = replace(scene.tracks, xy=MIDDLE + (scene.tracks.xy - MIDDLE) * zoom,
                          stamps_ns=scene.tracks.stamps_ns + n * 60 * 10**9)
@@ -126,6 +126,15 @@ def test_a_temperature_of_other_times_is_none():
     assert found is not None and 20 <= found.coldest_c < 21 and 37 < found.warmest_c <= 38
     assert Warmth.over(replace(samples, stamps_s=samples.stamps_s + 1000), turns_ns) is None
     assert Warmth.over(None, turns_ns) is None
+
+
+def test_a_gentle_stretch_says_little_about_a_drift():
+    gentle = synthetic_turn(LENS, 4.0, keyframes=14, tracks=150, noise_px=0.25, world=9)
+    sharp = scenes_of(5, tracks=150)[1:]
+    alone = solved(zoomed([1.0] * 4, sharp))
+    # a step fits a little better, and its fx is hardly known
+    found = solved(zoomed([1.02, 1.0, 1.0, 1.0, 1.0], [gentle.scene(START, 0), *sharp]))
+    assert found.drift is None and found.sigma[0] < 1.3 * alone.sigma[0]
 
 
 def test_two_turns_cannot_tell():
