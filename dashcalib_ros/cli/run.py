@@ -156,7 +156,7 @@ def _enough(found: Outlook) -> tuple[str, str]:
                  f'sharpest of {max(yaws):.0f}°')
     if not verdict.accepted:
         return (f'{text}: not enough, the result would be {verdict.level}: '
-                f'{"; ".join(each.what for each in verdict.told)}',
+                f'{"; ".join(each.what for each in verdict.main_reasons)}',
                 f'next: {remedies(verdict)[0]}')
     gentle = '' if max(yaws) >= SHARP_DEG else ', but without a sharp turn it may be weak'
     return f'{text}: enough for a calibration{gentle}', 'next: dashcalib run with the same INPUT'

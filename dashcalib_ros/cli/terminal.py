@@ -106,7 +106,7 @@ class Stages(Observer):
     def __init__(self, quiet: bool = False) -> None:
         console = Console(stderr=True)
         self._lines = not console.is_terminal and not quiet
-        self._told = time.monotonic()
+        self._shown_s = time.monotonic()
         # as wide as it may become, it fits 80 columns
         self._progress = Progress(
             SpinnerColumn(), TextColumn('{task.description}', markup=False), MovingBar(16),
@@ -150,6 +150,6 @@ class Stages(Observer):
 
     def _tell(self, text: str, done: float | None) -> None:
         now = time.monotonic()
-        if now - self._told >= EVERY_S:
-            self._told = now
+        if now - self._shown_s >= EVERY_S:
+            self._shown_s = now
             write_stderr(f'dashcalib: {text}' + ('' if done is None else f', {100 * done:.0f} %'))

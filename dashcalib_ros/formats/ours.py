@@ -319,7 +319,7 @@ def _no_intrinsics(name: str, verdict: Any, reasons: Any) -> InputError:
 def calibrated_camera(calibration: CalibrationData, name: str = 'estimate') -> NamedCamera:
     """Return the camera of a calibration. Raises InputError when it was refused."""
     if calibration.camera is None:
-        raise _no_intrinsics(name, calibration.verdict.level, calibration.verdict.told)
+        raise _no_intrinsics(name, calibration.verdict.level, calibration.verdict.main_reasons)
     shutter, field = calibration.rolling_shutter, calibration.field
     covariance, of_picture = calibration.covariance, calibration.picture_covariance
     if of_picture is not None:

@@ -277,10 +277,10 @@ def _all_failed(failures: dict[Path, InputError]) -> InputError:
     for path, error in failures.items():
         words = str(error).replace(str(path), '').replace(path.name, '')
         reasons.setdefault(words, []).append(path)
-    told = [f'{failures[path]}{f" (the same for {more})" if more else ""}'
-            for path, *rest in reasons.values() for more in [_names(rest)]]
+    lines = [f'{failures[path]}{f" (the same for {more})" if more else ""}'
+             for path, *rest in reasons.values() for more in [_names(rest)]]
     first = next(iter(failures.values()))
-    return InputError(first.code, f'none of the files can be read: {"; ".join(told)}')
+    return InputError(first.code, f'none of the files can be read: {"; ".join(lines)}')
 
 
 def _as_shells_list(sources: Sequence[FrameSource]) -> bool:
@@ -483,7 +483,7 @@ class JoinedSource(FrameSource):
 
     def _pictures(self, reading: Reading, start_ns: int = 0) -> Generator[Picture, None, None]:
         place = _Place(start_ns)
-        told = []
+        by_part = []
         for part in self._parts:
             inner = Reading()
             try:
@@ -493,10 +493,10 @@ class JoinedSource(FrameSource):
                 reading.warnings.append(Notice(
                     'E-FILE-SKIPPED',
                     f'{part.name} is skipped from image {inner.images} on: {error}'))
-            told.append((part.name, inner.summary()))
+            by_part.append((part.name, inner.summary()))
             place.index += inner.images
         reading.images = place.index
-        reading.warnings += _together(told)
+        reading.warnings += _together(by_part)
 
 
 class _Place:
@@ -556,11 +556,11 @@ class _Place:
         return self._next_ns - stamp_ns, True, False
 
 
-def _together(told: Sequence[tuple[str, Sequence[Notice]]]) -> tuple[Notice, ...]:
+def _together(by_part: Sequence[tuple[str, Sequence[Notice]]]) -> tuple[Notice, ...]:
     """Return the warnings of all sources; what several say in the same words is said once."""
     first: dict[str, Notice] = {}
     counts: Counter[str] = Counter()
-    for name, warnings in told:
+    for name, warnings in by_part:
         for warning in warnings:
             words = warning.replace(name, '')
             first.setdefault(words, warning if name in warning

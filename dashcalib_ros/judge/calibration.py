@@ -80,7 +80,7 @@ class Verdict:
         return self.level == 'accepted'
 
     @property
-    def told(self) -> tuple[Notice, ...]:
+    def main_reasons(self) -> tuple[Notice, ...]:
         """Return the reasons to show: of a refused result the first, as the others follow."""
         return self.reasons[:1] if self.level == 'refused' else self.reasons
 
@@ -461,7 +461,7 @@ class CalibrationData:
     def __repr__(self) -> str:
         """Return one line: the verdict, the parameters with their sigmas, or the first reason."""
         if self.camera is None:
-            return f'Calibration({self.verdict.level}: {"; ".join(self.verdict.told)})'
+            return f'Calibration({self.verdict.level}: {"; ".join(self.verdict.main_reasons)})'
         sigma = self.sigma or {}
         found = [f'{name} {_with_sigma(value, sigma.get(name, math.nan))}'
                  for name, value in self.camera.named.items()]
@@ -592,7 +592,7 @@ class CalibrationData:
     def _camera(self) -> Camera:
         if self.camera is None:
             raise InputError('E-CALIBRATION-REFUSED', 'the calibration was refused: '
-                             f'{"; ".join(self.verdict.told)}')
+                             f'{"; ".join(self.verdict.main_reasons)}')
         return self.camera
 
     @property

@@ -115,7 +115,7 @@ def _by_turns(given: Camera, image_size: tuple[int, int], solution: Solution | N
         if given.image_size == image_size:
             return Check('cannot tell', tuple(
                 f'the drive has no accepted calibration of its own: {text}'
-                for text in verdict.told))
+                for text in verdict.main_reasons))
         return Check('wrong', (size_reason(given, image_size, None, name),), cure=FIT_SIZE)
     px = Scale.of(image_size, config).px
 

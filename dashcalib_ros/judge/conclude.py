@@ -22,7 +22,12 @@ from dashcalib_ros.detect.turn import Turn, TurnId, is_turn
 from dashcalib_ros.errors import Notice, counted, spared
 from dashcalib_ros.input.motion import Samples, SensorStream, speeds_of
 from dashcalib_ros.input.scale import Scale
-from dashcalib_ros.judge.agreement import CONTRADICTS, STOOD, focal_disagreement
+from dashcalib_ros.judge.agreement import (
+    CONTRADICTS,
+    STOOD,
+    focal_disagreement,
+    separate_bends,
+)
 from dashcalib_ros.judge.calibration import (
     CalibrationData,
     CameraAt,
@@ -193,7 +198,7 @@ def _best_verdict(scenes: Sequence[Scene], evidence: Evidence, config: VerdictCo
         return _verdict_without_solution(evidence, config)
     # a gyro may confirm a single turn
     gyro = evidence.motion is not None and evidence.motion.rate is not None
-    found = [turn_count(len(scenes), config, gyro),
+    found = [turn_count(separate_bends(scenes), config, gyro, len(scenes)),
              yaw_in_all(sum(scene.yaw_deg for scene in scenes), config)]
     other = evidence.other_camera
     found = [two_cameras(other), *found] if other else found

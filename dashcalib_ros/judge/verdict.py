@@ -25,6 +25,7 @@ from dashcalib_ros.judge.agreement import (
     focal_disagreement,
     leverages,
     next_turn,
+    separate_bends,
     turns_of_another_camera,
 )
 from dashcalib_ros.judge.calibration import Condition, Level, Verdict, Witnesses
@@ -167,15 +168,21 @@ def gyro_confirms(solution: Solution) -> bool:
 
 
 def _number_of_turns(grounds: Grounds) -> Finding:
-    return turn_count(len(grounds.solution.scenes), grounds.config,
-                      gyro_confirms(grounds.solution))
+    scenes = grounds.solution.scenes
+    return turn_count(separate_bends(scenes), grounds.config, gyro_confirms(grounds.solution),
+                      len(scenes))
 
 
-def turn_count(count: int, config: VerdictConfig, confirmed: bool = False) -> Finding:
-    """Judge the number of turns. confirmed: by a gyro, so that one is enough."""
+def turn_count(count: int, config: VerdictConfig, confirmed: bool = False, scenes: int = 0
+               ) -> Finding:
+    """Judge the number of turns. confirmed: by a gyro, so that one is enough.
+
+    scenes: how many stretches there are, of which several may be of one bend.
+    """
+    parts = '' if scenes <= count else ' (of one bend several stretches count as one turn)'
     lone = ', and nothing confirms its numbers and their sigma' if count == 1 else ''
     return Finding('E-FEW-TURNS', _graded(False, count < config.min_turns and not confirmed),
-                   f'only {count} of at least {config.min_turns} turns could be used{lone}',
+                   f'only {count} of at least {config.min_turns} turns could be used{parts}{lone}',
                    MORE_TURNS).measured(
         'turns used', f'{count}',
         'the gyro confirms them' if confirmed else f'at least {config.min_turns}')

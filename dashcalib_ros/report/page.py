@@ -83,7 +83,7 @@ def report_html(calibration: CalibrationData, truth: NamedCamera | None = None,
         c=c, title=f'Calibration of {c.input_name}' if c.input_name else 'Calibration',
         headline=ADVICE[c.verdict.level], figures=key_figures(c), steps=next_steps(c, folder),
         warnings=(*c.warnings, *lost), **drawn,
-        reasons=[each.what for each in c.verdict.reasons], told=len(c.verdict.told),
+        reasons=[each.what for each in c.verdict.reasons], shown=len(c.verdict.main_reasons),
         conditions=conditions(c.verdict),
         parameters=parameter_rows(c),
         truth=[] if against is None else _truth_rows(against),
@@ -101,7 +101,7 @@ def difference_html(found: Comparison) -> str:
     head, rows = comparison_rows(found)
     return template('compare.html').render(
         title='Two calibrations', answers=answers(found), head=head, rows=rows,
-        maps=_maps(found), drawn='Over the picture', told='Parameters',
+        maps=_maps(found), drawn='Over the picture', results='Parameters',
         overlines=[f'{side}: {each.name}' + (f' ({each.verdict})' if each.verdict else '')
                    for side, each in (('A', found.a), ('B', found.b))],
         note=f'For images of {found.b.image_size[0]} × {found.b.image_size[1]} px. Parameters '

@@ -33,7 +33,7 @@ def rig_html(rig: RigCalibration, cameras: Sequence[Placed]) -> str:
                                         for reason in camera.reasons)],
         maps=[_drawn(rig, cameras, 1, 'From above', 'm to the left'),
               _drawn(rig, cameras, 2, 'From the side', 'm upwards')] if cameras else [],
-        drawn='Where they sit', told='Degrees of freedom', head=head,
+        drawn='Where they sit', results='Degrees of freedom', head=head,
         rows=[(name, camera.verdict, *_cells(camera)) for name, camera in rig.cameras.items()],
         note='Rotations and translations go from the optical axes of the base to those of the '
              'camera (x to the right, y down, z ahead), with one sigma and a verdict each.')

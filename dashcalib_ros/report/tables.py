@@ -73,7 +73,7 @@ def conclusion(verdict: Verdict) -> RenderableType:
     """Return the verdict, coloured, and its reasons; of a refused result the cause."""
     parts: list[RenderableType] = [labelled('verdict', verdict.level)]
     parts += [Padding.indent(line(f'{each.what} [{each.code}]' if each.code else each.what), 2)
-              for each in verdict.told]
+              for each in verdict.main_reasons]
     return Group(*parts)
 
 

@@ -371,7 +371,7 @@ class Drive:
             'turning magnitude': f'{now.magnitude:.4f}',
             'standing': now.standing,
             'verdict': verdict.level if verdict else '',
-            'reasons': '; '.join(verdict.told) if verdict else '',
+            'reasons': '; '.join(verdict.main_reasons) if verdict else '',
             **health.values,
             'warnings': '; '.join(warnings),
             'change': '; '.join(self.changes().values()),

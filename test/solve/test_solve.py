@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -32,6 +33,7 @@ from dashcalib_ros.judge.agreement import (
     focal_disagreement,
     leverages,
     outdated,
+    separate_bends,
     turns_of_another_camera,
 )
 from dashcalib_ros.judge.conclude import Evidence, conclude, outlook
@@ -574,6 +576,27 @@ def test_turns_that_determine_no_camera_are_not_called_dark(good):
     for why, code in (('dark', 'E-NO-SCENE'), (STOOD, 'E-CAR-STOOD')):
         dark = replace(seen, left_out=dict.fromkeys(seen.built, why))
         assert conclude(None, dark, CONFIG).verdict.codes == (code,)
+
+
+def test_the_end_of_a_sharp_bend_does_not_confirm_its_beginning(good):
+    first = good.scenes[0]
+    begin_ns, end_ns = first.tracks.stamps_ns[[0, -1]]
+
+    def scene(begin_s, right_deg):
+        tracks = SimpleNamespace(stamps_ns=np.array([begin_s, begin_s + 4]) * 10**9)
+        return SimpleNamespace(turn=TurnId.at(round(10 * begin_s)), tracks=tracks,
+                               right_deg=right_deg, yaw_deg=abs(right_deg))
+
+    for others, bends in (([(4.1, 10.0)], 1), ([(4.1, 10.0), (8.2, 80.0)], 1),
+                          ([(4.1, -10.0)], 2), ([(9.0, 80.0)], 2), ([(4.1, 10.0), (20, 5.0)], 2)):
+        scenes = [scene(0.0, 88.0), *(scene(*each) for each in others)]
+        assert separate_bends(scenes) == separate_bends(scenes[::-1]) == bends
+    assert separate_bends([scene(0.0, 20.0), scene(4.1, 20.0)]) == 2
+
+    after = replace(first, turn=TurnId.at(999), tracks=replace(
+        first.tracks, stamps_ns=first.tracks.stamps_ns + (end_ns - begin_ns) + 10**8))
+    found = outlook([first, after], evidence_for(good), CONFIG.verdict).verdict
+    assert found.codes[0] == 'E-FEW-TURNS' and 'of one bend' in found.reasons[0]
 
 
 def test_the_outlook_counts_turns_and_angles_as_the_verdict_does(good):
