@@ -37,6 +37,9 @@ LOOK_S, ON_WAIT_S = 0.2, 0.02
 # s; before the second attempt, doubled before each further one
 BACK_OFF_S = 1.0
 LONGEST_BACK_OFF_S = 60.0
+# turns that wait for a worker in a live drive, each with up to 61 images: 56 MB of 1280x720. On a
+# busy machine five of them were more than half of the node's memory
+LIVE_QUEUE = 2
 # of a call that somebody waits for
 HIGHEST = (math.inf,)
 
@@ -415,5 +418,5 @@ def pool_of(config: Config, live: bool, verbose: bool, inline: bool,
         config, InlineWorker if inline else partial(
             ChildWorker, live, verbose, config.workers, on_trouble),
         partial(load_all if live else load_solving, config.reconstruct.used),
-        queue=config.turns.wanted if live else None, on_trouble=on_trouble,
+        queue=LIVE_QUEUE if live else None, on_trouble=on_trouble,
         keep_pictures=not live, on_wait=on_wait)
