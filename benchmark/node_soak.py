@@ -182,7 +182,8 @@ def broken_limits(bench: Recorder, log: str, sent: Sequence[int], memory: Sequen
     first = min(bench.stamps, default=None)
     unanswered = sum(stamp not in bench.stamps for stamp in sent if first and stamp >= first)
     # what a busy machine loses on the way cannot be answered
-    lost, quarter = len(sent) - bench.count('received'), len(memory) // 4
+    # and one may come that a killed driver has not noted
+    lost, quarter = max(len(sent) - bench.count('received'), 0), len(memory) // 4
     before, after = (float(np.median(memory[part])) for part in (
         slice(quarter, 2 * quarter), slice(-quarter, None)))
     early = [text for text, when in bench.changes.items() if when < anew]
