@@ -220,8 +220,9 @@ def report(bench: Recorder, log: str, sent: list[int], restarts: int, memory: li
     tens = ', '.join(f'{np.mean(memory[n:n + 300]):.0f}' for n in range(0, len(memory), 300))
     lines += [f'| CPU of the node\'s process, of one core | {100 * share:.1f} % |',
               f'| resident memory, mean of each 5 minutes | {tens} MB (most {max(memory):.0f}) |']
+    # the node's home is a folder of this run
     said = Counter(re.sub(r'\d+(\.\d+)?', '#', re.sub(r'^\[.*?\]: ', '', line))
-                   for line in log.splitlines())
+                   for line in re.sub(r'/\S+/\.ros/', '~/.ros/', log).splitlines())
     first = bench.said[0][0] if bench.said else 0.0
     return '\n'.join([
         *lines, '', 'The log, numbers aside, and how often:', '',
