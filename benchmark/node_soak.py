@@ -181,8 +181,8 @@ def broken_limits(bench: Recorder, log: str, sent: Sequence[int], memory: Sequen
     """Return what did not hold, one line each. anew: when the camera was mounted anew, s."""
     first = min(bench.stamps, default=None)
     unanswered = sum(stamp not in bench.stamps for stamp in sent if first and stamp >= first)
-    # what a busy machine loses on the way cannot be answered
-    # and one may come that a killed driver has not noted
+    # what a busy machine loses on the way cannot be answered; one more may come than a
+    # killed driver has noted
     lost, quarter = max(len(sent) - bench.count('received'), 0), len(memory) // 4
     before, after = (float(np.median(memory[part])) for part in (
         slice(quarter, 2 * quarter), slice(-quarter, None)))

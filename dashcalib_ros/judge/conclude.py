@@ -22,12 +22,7 @@ from dashcalib_ros.detect.turn import Turn, TurnId, is_turn
 from dashcalib_ros.errors import Notice, counted, spared
 from dashcalib_ros.input.motion import Samples, SensorStream, speeds_of
 from dashcalib_ros.input.scale import Scale
-from dashcalib_ros.judge.agreement import (
-    CONTRADICTS,
-    STOOD,
-    focal_disagreement,
-    separate_bends,
-)
+from dashcalib_ros.judge.agreement import CONTRADICTS, STOOD, focal_disagreement
 from dashcalib_ros.judge.calibration import (
     CalibrationData,
     CameraAt,
@@ -198,7 +193,7 @@ def _best_verdict(scenes: Sequence[Scene], evidence: Evidence, config: VerdictCo
         return _verdict_without_solution(evidence, config)
     # a gyro may confirm a single turn
     gyro = evidence.motion is not None and evidence.motion.rate is not None
-    found = [turn_count(separate_bends(scenes), config, gyro, len(scenes)),
+    found = [turn_count(scenes, config, gyro),
              yaw_in_all(sum(scene.yaw_deg for scene in scenes), config)]
     other = evidence.other_camera
     found = [two_cameras(other), *found] if other else found
@@ -442,7 +437,7 @@ def _verdict_without_solution(evidence: Evidence, config: VerdictConfig) -> Verd
     other = evidence.other_camera
     verdict = verdict_of([two_cameras(other), found] if other else [found])
     return replace(verdict, conditions=(*verdict.conditions, *(
-        each.condition for each in (turn_count(0, config), yaw_in_all(0.0, config)))))
+        each.condition for each in (turn_count((), config), yaw_in_all(0.0, config)))))
 
 
 def _summary(turn: Turn, scene: Scene | None, evidence: Evidence, solution: Solution | None

@@ -31,6 +31,7 @@ from dashcalib_ros.judge.agreement import (
 from dashcalib_ros.judge.calibration import Condition, Level, Verdict, Witnesses
 from dashcalib_ros.judge.mount import roll_of_path
 from dashcalib_ros.reconstruct.heading import off_axis_deg, roll_deg
+from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve.evidence import (
     HIDDEN_DEG,
     LARGE_FIELD,
@@ -168,18 +169,14 @@ def gyro_confirms(solution: Solution) -> bool:
 
 
 def _number_of_turns(grounds: Grounds) -> Finding:
-    scenes = grounds.solution.scenes
-    return turn_count(separate_bends(scenes), grounds.config, gyro_confirms(grounds.solution),
-                      len(scenes))
+    return turn_count(grounds.solution.scenes, grounds.config, gyro_confirms(grounds.solution))
 
 
-def turn_count(count: int, config: VerdictConfig, confirmed: bool = False, scenes: int = 0
-               ) -> Finding:
-    """Judge the number of turns. confirmed: by a gyro, so that one is enough.
-
-    scenes: how many stretches there are, of which several may be of one bend.
-    """
-    parts = '' if scenes <= count else ' (of one bend several stretches count as one turn)'
+def turn_count(scenes: Sequence[Scene], config: VerdictConfig, confirmed: bool = False) -> Finding:
+    """Judge the number of turns. confirmed: by a gyro, so that one is enough."""
+    count = separate_bends(scenes)
+    parts = ('' if len(scenes) == count else
+             ' (of one bend several stretches count as one turn)')
     lone = ', and nothing confirms its numbers and their sigma' if count == 1 else ''
     return Finding('E-FEW-TURNS', _graded(False, count < config.min_turns and not confirmed),
                    f'only {count} of at least {config.min_turns} turns could be used{parts}{lone}',

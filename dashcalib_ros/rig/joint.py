@@ -509,11 +509,13 @@ def _jumped(problem: Problem) -> frozenset[str]:
     Or whose last pair is broken: after others, later ones show where the camera sits.
     """
     groups = [problem.linearised(members) for members in problem.groups]
-    normal = _normal(problem, groups)
+    normal, unknowns = _normal(problem, groups), slice(problem.unknowns)
+    step = normal.step[unknowns]
+    covariance = np.asarray(np.linalg.inv(normal.information[unknowns, unknowns]), np.float64)
     found = {problem.pairs[n].other[0]
              for members, rows in zip(problem.groups, groups, strict=True)
-             for n, jumps in zip(members, _jumps(problem, members, rows, normal), strict=True)
-             if jumps}
+             for n, jumps in zip(members, _jumps(problem, members, rows, step, covariance),
+                                 strict=True) if jumps}
     for pair in problem.broken:
         later = [each for each in problem.pairs if each.other[0] == pair.other[0]
                  and problem.when(each)[-1] > problem.when(pair)[-1]]
@@ -521,39 +523,38 @@ def _jumped(problem: Problem) -> frozenset[str]:
     return frozenset(found)
 
 
-def _jumps(problem: Problem, members: Sequence[int], rows: Rows, normal: Normal) -> list[bool]:
+def _jumps(problem: Problem, members: Sequence[int], rows: Rows, step: Floats,
+           covariance: Floats) -> list[bool]:
     """Return whether the camera jumps within each of the pairs of one reference scene.
 
     A score test: how much a rotation of the camera from one of its keyframes on would explain. Of
-    the first and last keyframe alone that is an error of the path's end.
+    the first and last keyframe alone that is an error of the path's end. step: (m,) to the
+    optimum; covariance: (m, m).
     """
-    unknowns = slice(problem.unknowns)
-    covariance = np.linalg.inv(normal.information[unknowns, unknowns])
-    root = np.linalg.cholesky(rows.covariance(problem.noise))
-    known, off = (solve_triangular(root, each, lower=True) for each in (
-        rows.jacobian[:, unknowns],
-        rows.off - rows.jacobian[:, unknowns] @ normal.step[unknowns]))
-    found, start = [], 0
-    for n in members:
-        pair = problem.pairs[n]
+    blocks = []
+    for pair in (problem.pairs[n] for n in members):
         count = len(pair.rows)
         turned = np.zeros((count, 6, 3))
         turned[:, :3] = np.eye(3)
         turned[:, 3:] = -cross(problem.scene(pair.other).trajectory.translations[pair.rows])
-        later = np.tri(count)[:, 1:, None, None] * turned[:, None]
-        columns = np.zeros((len(off), count - 1, 3))
-        columns[start:start + 6 * count] = later.transpose(0, 2, 1, 3).reshape(
-            6 * count, count - 1, 3)
-        start += 6 * count
-        white = solve_triangular(root, columns.reshape(len(off), -1), lower=True)
-        score = (white.T @ off).reshape(count - 1, 3)
-        by_known = (white.T @ known).reshape(count - 1, 3, -1)
-        white = white.reshape(len(off), count - 1, 3)
-        information = (np.einsum('rka,rkb->kab', white, white)
+        # by where the jump begins: at the third keyframe at the earliest, the last but one latest
+        later = np.tri(count)[:, 2:-1, None, None] * turned[:, None]
+        blocks.append(later.transpose(0, 2, 1, 3).reshape(6 * count, -1))
+    unknowns = len(step)
+    white, off, _ = replace(rows, jacobian=np.column_stack(
+        [rows.jacobian[:, :unknowns], block_diag(*blocks)])).whitened(problem.noise)
+    known, turns = white[:, :unknowns], white[:, unknowns:]
+    off = off - known @ step
+    found, ends = [], np.cumsum([block.shape[1] for block in blocks])[:-1]
+    for own in np.split(turns, ends, axis=1):
+        score = (own.T @ off).reshape(-1, 3)
+        by_known = (own.T @ known).reshape(len(score), 3, -1)
+        own = own.reshape(len(off), -1, 3)
+        information = (np.einsum('rka,rkb->kab', own, own)
                        - by_known @ covariance @ by_known.transpose(0, 2, 1))
         jump = np.linalg.solve(information, score[..., None])[..., 0]
         gains = np.sum(jump * score, axis=1)
-        best = 1 + int(np.argmax(gains[1:-1]))
+        best = int(np.argmax(gains))
         found.append(bool(gains[best] > JUMP**2
                           and np.degrees(np.linalg.norm(jump[best])) > JUMP_DEG))
     return found
