@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from importlib import metadata
 from pathlib import Path
 
 import cv2
@@ -47,9 +48,9 @@ sys.exit(main(sys.argv[1] if named else 'calibrator', sys.argv[1 + named:]))
 
 
 def profiles(path):
-    """Return what lets Fast DDS read a file, by its name for the variable and by Kilted's."""
-    return dict.fromkeys(
-        ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE'), str(path))
+    """Return what lets Fast DDS read a file; Kilted's rclpy is 9, and warns of the older name."""
+    kilted = int(metadata.version('rclpy').partition('.')[0]) >= 9
+    return {f'{"FASTDDS" if kilted else "FASTRTPS"}_DEFAULT_PROFILES_FILE': str(path)}
 
 
 # for a driver's process

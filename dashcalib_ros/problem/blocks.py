@@ -286,7 +286,7 @@ def _undistorted(camera: Camera) -> Floats:
 # s: most dashcams have a rolling shutter, of 10 to 30 ms
 READOUT_SIGMA_S = 0.02
 # prior sigmas of how fast a camera turns: about the axis of the turn, beyond what the spline says,
-# and about the others in all (3 degrees a second)
+# and about the others in all on a smooth road (3 degrees a second)
 STEERING_RAD_S, BUMPS_RAD_S = 0.005, 0.05
 # degrees: bumps turn a camera by less
 STEERED_DEG = 15.0
@@ -313,12 +313,14 @@ class Shake(ImageBlock):
     """By how much each camera turns, rad from the first row to the last, beyond its steering.
 
     As bumps make it; Imaging.steering has the rest. axes: by stretch (3,) about which the car
-    turns, in the camera's axes. readout_s: at which the prior is taken; a step does not change it,
-    or a longer readout would make the same shaking likelier.
+    turns, in the camera's axes. readout_s, bumps: s and rad, at which the prior is taken; a step
+    does not change them, or a longer readout would make the same shaking likelier. On a rough road
+    bumps is how far the images shake (RMS): of a prior for a smooth one the readout would make up.
     """
 
     axes: Mapping[TurnId, Floats] = field(default_factory=dict)
     readout_s: float = 0.0
+    bumps: float = 0.0
 
     name: ClassVar[str] = 'shake'
     count: ClassVar[int] = 3
@@ -326,21 +328,21 @@ class Shake(ImageBlock):
 
     def prior_of(self, stretch: Stretch) -> tuple[Floats, Floats]:
         used = stretch.observed.keyframes
-        each = shake_precision(self.axes[stretch.turn], self.readout_s)
+        axis, time_s = self.axes[stretch.turn], max(abs(self.readout_s), COUPLED_READOUT_S)
+        # bumps pitch and roll the car; about the axis of the turn it is the driver who turns it
+        bumps, steering = max(self.bumps, BUMPS_RAD_S * time_s), STEERING_RAD_S * time_s
+        each = np.eye(3) / bumps**2 + np.outer(axis, axis) * (steering**-2 - bumps**-2)
         return np.asarray(np.kron(np.eye(len(used)), each)), self.of(stretch)[used].ravel()
 
     def anchored(self, imaging: Imaging) -> Shake:
-        return replace(self, readout_s=imaging.readout_s,
-                       value=self.value if imaging.coupled else {})
-
-
-def shake_precision(axis: Floats, readout_s: float) -> Floats:
-    """Return (3, 3) the inverse of the prior covariance of how a keyframe shakes, rad^-2.
-
-    Bumps pitch and roll the car; about the axis of the turn, (3,), it is the driver who turns it.
-    """
-    return np.asarray((np.eye(3) / BUMPS_RAD_S**2 + np.outer(axis, axis) * (
-        STEERING_RAD_S**-2 - BUMPS_RAD_S**-2)) / max(abs(readout_s), COUPLED_READOUT_S)**2)
+        if not imaging.coupled:
+            return replace(self, readout_s=imaging.readout_s, bumps=0.0, value={})
+        shaken = [turned[turned.any(axis=1)] @ (np.eye(3) - np.outer(axis, axis))
+                  for turn, turned in self.value.items() for axis in (self.axes[turn],)]
+        count = sum(map(len, shaken))
+        # about two axes
+        size = np.sqrt(sum(np.sum(turned**2) for turned in shaken) / max(2 * count, 1))
+        return replace(self, readout_s=imaging.readout_s, bumps=float(size))
 
 
 # the field over the picture
