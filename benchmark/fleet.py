@@ -84,7 +84,7 @@ def write_clip(path: Path, frames: Sequence[Frame], lens: Lens) -> Path:
 
 
 def fleet(folder: Path, cache: Path, videos: int) -> Path:
-    """Make 200 clips of 20 cameras of two makes, 0 to 3 turns each; return the manifest.
+    """Make 200 clips of 20 cameras of two models, 0 to 3 turns each; return the manifest.
 
     So many cameras have four videos each; the clips of the others are gathered turns, made from
     points with exact truth. One clip in 40 cannot be read.
@@ -100,7 +100,7 @@ def fleet(folder: Path, cache: Path, videos: int) -> Path:
             row['clip'] = str(bad.relative_to(folder))
     manifest = folder / 'fleet.csv'
     with manifest.open('w', newline='') as stream:
-        writer = csv.DictWriter(stream, ['clip', 'camera', 'make'])
+        writer = csv.DictWriter(stream, ['clip', 'camera', 'camera_model'])
         writer.writeheader()
         writer.writerows(rows)
     return manifest
@@ -119,7 +119,7 @@ def _video_rows(folder: Path, cache: Path, cameras: int, rng: np.random.Generato
         for n, (begin, end) in enumerate(parts):
             path = write_clip(folder / f'videos/{camera}-{n}.avi', frames[begin:end], lens)
             yield {'clip': str(path.relative_to(folder)), 'camera': f'v{camera:02}',
-                   'make': 'north'}
+                   'camera_model': 'north'}
 
 
 def _made_rows(folder: Path, count: int, cameras: int, rng: np.random.Generator
@@ -133,7 +133,7 @@ def _made_rows(folder: Path, count: int, cameras: int, rng: np.random.Generator
         if not path.exists():
             written(clip_of(lenses[camera], yaws, world=10 * n, tracks=60, keyframes=7), path)
         yield {'clip': str(path.relative_to(folder)), 'camera': f'm{camera:02}',
-               'make': 'south' if camera % 2 else 'north'}
+               'camera_model': 'south' if camera % 2 else 'north'}
 
 
 def bends(seed: int, units: int = 30, zooms: Sequence[float] = (1.15, 0.8, 1.4)

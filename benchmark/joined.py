@@ -66,7 +66,7 @@ def row_of(folders: Sequence[Path], fps: float, truth: Mapping[str, Any]) -> dic
     """Calibrate a drive of one folder or several; count the cuts at which it goes on."""
     # one folder in a list is a folder
     drive = [str(folder) for folder in folders]
-    estimator = MotionEstimator(Config().motion)
+    estimator = MotionEstimator(Config().tracking)
     gaps = sum(motion.after_gap for frame in open_frames(drive, fps=fps)
                if (motion := estimator.push(frame)) is not None)
     result, _ = calibrate(open_frames(drive, fps=fps), Config())
@@ -149,7 +149,7 @@ def joints_of(pictures: Sequence[Path], fps: float) -> dict[tuple[bool, str], li
     images = [np.asarray(cv2.imread(str(picture), cv2.IMREAD_GRAYSCALE), np.uint8)
               for picture in pictures]
     rng = np.random.default_rng(0)
-    estimator = MotionEstimator(Config().motion)
+    estimator = MotionEstimator(Config().tracking)
     said: dict[tuple[bool, str], list[bool]] = {}
     moved = [math.inf]
     for index, image in enumerate(images):

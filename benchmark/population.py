@@ -274,7 +274,7 @@ def reconstructed(seed: int, config: Config) -> Case:
     drive = drive_of(seed)
     lens: AnyLens = drive.wide_lens if isinstance(drive, WideDrive) else drive.lens
     with Calibrator(config, inline=True) as calibrator:
-        for frame in _looked_at(drive, config.motion.rate):
+        for frame in _looked_at(drive, config.tracking.rate):
             calibrator.push(frame)
         calibrator.detection.finish()
         chosen = calibrator.scenes

@@ -154,7 +154,7 @@ def _thinned(task: Task) -> tuple[Frame, ...]:
     """Return the frames at the detector's rate, as large as they are reconstructed."""
     kept: list[Frame] = []
     for frame in task.frames:
-        if not kept or frame.stamp_ns - kept[-1].stamp_ns > 0.9e9 / task.config.motion.rate:
+        if not kept or frame.stamp_ns - kept[-1].stamp_ns > 0.9e9 / task.config.tracking.rate:
             kept.append(Scale.of(frame.size, task.config).frame(frame))
     return tuple(kept)
 

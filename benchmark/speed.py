@@ -105,7 +105,7 @@ def detection(pictures: Pictures, seconds: float) -> dict[str, Any]:
 def _detect_s(frames: Iterable[Frame]) -> float:
     """Return the seconds that detection takes, as Calibrator.push() does it."""
     config = Config()
-    motion, detector = MotionEstimator(config.motion, config.mask), TurnDetector(config.turns)
+    motion, detector = MotionEstimator(config.tracking, config.mask), TurnDetector(config.turns)
     spent = 0.0
     for frame in frames:
         started = time.perf_counter()
@@ -150,7 +150,7 @@ def hour(pictures: Pictures, minutes: float) -> dict[str, Any]:
     cv2.setNumThreads(1)
     images = [frame.image for frame in pictures]
     config = Config()
-    motion, detector = MotionEstimator(config.motion, config.mask), TurnDetector(config.turns)
+    motion, detector = MotionEstimator(config.tracking, config.mask), TurnDetector(config.turns)
     by_minute: list[float] = []
     memory: list[float] = []
     started = time.perf_counter()

@@ -48,7 +48,7 @@ expert = functools.partial(setting, expert=True)
 
 
 @dataclass(frozen=True)
-class MotionConfig:
+class TrackingConfig:
     """frames -> tracks -> epipoles, for detection only (calibration tracks again, finer)."""
 
     rate: float = setting(
@@ -58,14 +58,20 @@ class MotionConfig:
         640, 'px; the width of wider images is divided by a whole number until it fits', 64, 8192)
     points: int = expert(
         300, 'points tracked at a time; 400 find the same turns and take 20 % longer', 50, 5000)
+    standing_px: float = expert(
+        0.3, 'px at the working width; the car stands if the median point moves less', 0.0, 5.0)
+
+
+@dataclass(frozen=True)
+class MotionConfig:
+    """The car's own sensors."""
+
     use: str = expert(
         'information', 'use of a gyro: in the solution if its scale is known, or only as a check',
         choices=('information', 'witness'))
     gyro_scale_sigma: float = expert(
         0.03, 'standard deviation (sigma) of the gyro scale; 0.01 to 0.03, calibrated: 0.001',
         0.0, 1.0)
-    standing_px: float = expert(
-        0.3, 'px at the working width; the car stands if the median point moves less', 0.0, 5.0)
 
 
 @dataclass(frozen=True)
@@ -292,7 +298,8 @@ class MonitorConfig:
 
 
 # settings by their earlier names, which are read, too
-RENAMED = {'threads': 'workers'}
+RENAMED = {'threads': 'workers', **{f'motion.{name}': f'tracking.{name}' for name in (
+    'rate', 'width', 'points', 'standing_px')}}
 
 
 @dataclass(frozen=True)
@@ -318,6 +325,7 @@ class Config:
     min_width: int = expert(
         640, 'px; narrower images are enlarged 2, 3 or 4 times, so that limits in px fit',
         1, 4096)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
     mask: MaskConfig = field(default_factory=MaskConfig)
     known: KnownConfig = field(default_factory=KnownConfig)
@@ -410,7 +418,7 @@ def _dotted(changes: Mapping[str, Any], known: Mapping[str, Any]) -> Iterator[tu
     groups = {group.name for group in dataclasses.fields(Config)} - {*known}
     for key, value in changes.items():
         if isinstance(value, Mapping) and key not in known:
-            yield from ((f'{key}.{inner}', item) for inner, item in value.items())
+            yield from ((present_name(f'{key}.{inner}'), item) for inner, item in value.items())
         # None: a group of which every line is a comment
         elif value is not None or key not in groups:
             yield present_name(str(key)), value

@@ -13,7 +13,7 @@ from refused import refused
 
 from dashcalib_ros.config import (
     Config,
-    MotionConfig,
+    TrackingConfig,
     TurnsConfig,
     VerdictConfig,
     _settings,
@@ -47,7 +47,7 @@ def test_about_twenty_settings_are_for_users_and_come_first():
     assert experts == sorted(experts)
     users = {name for name in SPECS if not SPECS[name].metadata['expert']}
     assert 10 <= len(users) <= 22
-    assert {'turns.wanted', 'turns.store', 'workers', 'motion.rate'} <= users
+    assert {'turns.wanted', 'turns.store', 'workers', 'tracking.rate'} <= users
     assert not {'scene.loss_px', 'intrinsics.loss', 'verdict.max_leverage'} & users
 
 
@@ -88,9 +88,10 @@ def test_out_of_range_names_the_range(name):
 
 @pytest.mark.parametrize(('name', 'value'), [
     ('turns.wanted', 2.5), ('turns.wanted', '5'), ('turns.wanted', True), ('turns.wanted', None),
-    ('motion.rate', 'fast'), ('motion.rate', True), ('motion.rate', None), ('motion.rate', [10.0]),
+    ('tracking.rate', 'fast'), ('tracking.rate', True), ('tracking.rate', None),
+    ('tracking.rate', [10.0]),
     ('mask.enabled', 1), ('mask.enabled', 'yes'), ('seed', 1.0), ('seed', False),
-    ('motion.rate', {'hz': 10}), ('mask.segmentation', None), ('mask.segmentation', True),
+    ('tracking.rate', {'hz': 10}), ('mask.segmentation', None), ('mask.segmentation', True),
     ('mask.segmentation_classes', [63, 64]),
 ])
 def test_wrong_type_names_the_right_one(name, value):
@@ -100,7 +101,7 @@ def test_wrong_type_names_the_right_one(name, value):
 
 @pytest.mark.parametrize(('name', 'hint'), [
     ('turns.half_with', 'turns.half_width'), ('turn.wanted', 'turns.wanted'), ('sed', 'seed'),
-    ('motion.Rate', 'motion.rate')])
+    ('tracking.Rate', 'tracking.rate')])
 def test_a_typo_gets_the_nearest_name(name, hint):
     with refused(ConfigError, 'E-CONFIG-UNKNOWN', f'did you mean {hint}, '):
         Config().replace({name: 1})
@@ -121,33 +122,37 @@ def test_names_that_are_attributes_but_no_settings(name):
 
 
 def test_an_integer_is_a_fine_float():
-    config = Config().replace({'motion.rate': 10, 'turns.half_width': 2})
-    assert type(config.motion.rate) is float and config.motion.rate == 10.0
+    config = Config().replace({'tracking.rate': 10, 'turns.half_width': 2})
+    assert type(config.tracking.rate) is float and config.tracking.rate == 10.0
     assert type(config.turns.half_width) is float
 
 
 def test_an_integer_is_a_fine_float_in_yaml_and_in_python():
-    text = 'motion: {rate: 12}\nverdict:\n  min_yaw_deg: 70\nturns.half_width: 2\n'
+    text = 'tracking: {rate: 12}\nverdict:\n  min_yaw_deg: 70\nturns.half_width: 2\n'
     config = Config.of(yaml.safe_load(text))
-    assert (config.motion.rate, config.verdict.min_yaw_deg, config.turns.half_width) == (12, 70, 2)
-    made = Config(motion=MotionConfig(rate=12), turns=TurnsConfig(half_width=2),
+    assert (config.tracking.rate, config.verdict.min_yaw_deg) == (12, 70)
+    assert config.turns.half_width == 2
+    made = Config(tracking=TrackingConfig(rate=12), turns=TurnsConfig(half_width=2),
                   verdict=VerdictConfig(min_yaw_deg=70))
     assert made == config
-    assert type(made.replace({'motion.rate': 15}).motion.rate) is float
+    assert type(made.replace({'tracking.rate': 15}).tracking.rate) is float
 
 
 @pytest.mark.parametrize('value', [10**30, -10**400])
 def test_an_integer_that_no_float_can_hold(value):
-    with refused(ConfigError, 'E-CONFIG-TYPE', 'motion.rate'):
-        Config().replace({'motion.rate': value})
-    with refused(ConfigError, 'E-CONFIG-TYPE', 'motion.rate'):
-        Config(motion=MotionConfig(rate=value))
+    with refused(ConfigError, 'E-CONFIG-TYPE', 'tracking.rate'):
+        Config().replace({'tracking.rate': value})
+    with refused(ConfigError, 'E-CONFIG-TYPE', 'tracking.rate'):
+        Config(tracking=TrackingConfig(rate=value))
 
 
 def test_a_renamed_setting_is_read_with_a_warning():
     with pytest.warns(FutureWarning, match='workers'):
         config = Config.of({'threads': 3})
     assert config.workers == config.threads == 3 and 'threads' not in config.flat()
+    for settings in ({'motion.rate': 8.0}, {'motion': {'rate': 8.0, 'use': 'witness'}}):
+        with pytest.warns(FutureWarning, match=r'motion\.rate is called tracking\.rate now'):
+            assert Config.of(settings).tracking.rate == 8.0
 
 
 def test_a_config_made_directly_is_checked_too():
@@ -155,8 +160,8 @@ def test_a_config_made_directly_is_checked_too():
         Config(turns=TurnsConfig(wanted=0))
     with refused(ConfigError, 'E-CONFIG-RANGE', 'workers'):
         Config(workers=0)
-    with refused(ConfigError, 'E-CONFIG-FINITE', 'motion.rate'):
-        Config(motion=MotionConfig(rate=math.nan))
+    with refused(ConfigError, 'E-CONFIG-FINITE', 'tracking.rate'):
+        Config(tracking=TrackingConfig(rate=math.nan))
 
 
 def test_a_group_is_no_setting():
@@ -211,5 +216,5 @@ def test_replace_leaves_the_original_alone():
 
 
 def test_what_flat_gives_makes_the_same_config_again():
-    config = Config().replace({'turns.wanted': 7, 'mask.enabled': False, 'motion.rate': 8})
+    config = Config().replace({'turns.wanted': 7, 'mask.enabled': False, 'tracking.rate': 8})
     assert Config.of(config.flat()) == config

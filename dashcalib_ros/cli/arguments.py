@@ -447,13 +447,13 @@ COMMANDS = {
         'dashcalib batch clips.csv --out fleet', (
             ('manifest', {'metavar': 'MANIFEST',
                           'help': '.csv, .jsonl or .parquet with a column clip, and optional '
-                                  'columns camera, make (the model of camera), fps, topic, time; '
-                                  'a folder of clips; or a glob in quotes'}),
+                                  'columns camera, camera_model, fps, topic, time; a folder of '
+                                  'clips; or a glob in quotes'}),
             ('--out', {'required': True, 'metavar': 'DIR',
                        'help': 'a folder, or an address such as s3://bucket/fleet'}),
             ('--group-by', {'metavar': 'REGEX',
                             'help': "takes the camera from a clip's name: its first group, or "
-                                    'its groups (?P<camera>...) and (?P<make>...)'}),
+                                    'its groups (?P<camera>...) and (?P<camera_model>...)'}),
             ('--workers', {'type': count, 'metavar': 'N',
                            'help': 'number of processes (default: one per core, as far as memory '
                                    'allows); the result does not depend on it'}),

@@ -58,7 +58,7 @@ class Detection:
         self._rises = 0
         self.standing = False
         self._config, self._keep = config, keep
-        self._motion = MotionEstimator(config.motion, config.mask, mask)
+        self._motion = MotionEstimator(config.tracking, config.mask, mask)
         self._two_pictures = TwoPictures()
         self._lines = LineCollector(beside=beside)
         # more turns than wanted replace those without a scene; --turns may be above the capacity

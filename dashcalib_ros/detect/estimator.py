@@ -11,7 +11,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats, Floats32, GreyImage, Ints, Mask
 from dashcalib_ros.camera.camera import resized_pixels
-from dashcalib_ros.config import MaskConfig, MotionConfig
+from dashcalib_ros.config import MaskConfig, TrackingConfig
 from dashcalib_ros.detect.continuity import goes_on
 from dashcalib_ros.detect.epipoles import epipoles_of, turning
 from dashcalib_ros.detect.mask import CELL, EgoMask
@@ -114,7 +114,7 @@ class MotionEstimator:
     # the newest image that is left out and looked at
     _between: GreyImage | None = None
 
-    def __init__(self, config: MotionConfig, mask: MaskConfig | None = None,
+    def __init__(self, config: TrackingConfig, mask: MaskConfig | None = None,
                  valid: Mask | None = None) -> None:
         """valid: (height, width) of the full image, False where the user masks; None: nowhere.
 

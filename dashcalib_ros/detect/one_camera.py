@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether all images of a stream are of one camera: some of the skipped ones are compared.
 
-Images that come faster than motion.rate are skipped, and all images used may be of one camera
+Images that come faster than tracking.rate are skipped, and all images used may be of one camera
 while the skipped ones are of another. So one of these is compared now and then: its points must
 lie where the images before and after it predict. Let u be a point's step between these two, and v
 its step from the first to the skipped image. The car's speed hardly changes in so short a time;

@@ -62,7 +62,7 @@ class Camera:
     """
 
     name: str
-    make: str
+    camera_model: str
     rows: Sequence[Row]
     results: dict[int, ClipResult] = field(default_factory=dict)
     own: CameraResult | None = None
@@ -104,9 +104,9 @@ def cameras_of(rows: Sequence[Row], shard: tuple[int, int] = (1, 1)) -> list[Cam
         found.setdefault(row.camera or row.name, []).append(row)
     cameras = []
     for name in sorted(found)[shard[0] - 1::shard[1]]:
-        makes = {row.make for row in found[name] if row.make}
-        # a camera of two makes has none that can be trusted
-        cameras.append(Camera(name, makes.pop() if len(makes) == 1 else '', found[name]))
+        models = {row.camera_model for row in found[name] if row.camera_model}
+        # a camera of two models has none that can be trusted
+        cameras.append(Camera(name, models.pop() if len(models) == 1 else '', found[name]))
     return cameras
 
 
@@ -144,7 +144,7 @@ def _gather_and_solve(cameras: Sequence[Camera], out: str, config: Config, engin
                 _failed(camera, outcome)
             else:
                 camera.own, camera.verdict = outcome, outcome.verdict
-                camera.clips = tables.clip_rows(camera.name, camera.make, camera.gathered,
+                camera.clips = tables.clip_rows(camera.name, camera.camera_model, camera.gathered,
                                                 outcome.shares)
             tell(camera, None)
             continue
@@ -155,7 +155,7 @@ def _gather_and_solve(cameras: Sequence[Camera], out: str, config: Config, engin
         camera.results[row.number] = outcome
         tell(camera, outcome)
         if len(camera.results) == len(camera.rows):
-            camera.clips = tables.clip_rows(camera.name, camera.make, camera.gathered, {})
+            camera.clips = tables.clip_rows(camera.name, camera.camera_model, camera.gathered, {})
             # where it has files of earlier, they must not stay as they are
             if (all(result.code == GONE.code for _, result in camera.gathered)
                     and not storage.stamp(storage.joined(out, tables.camera_folder(camera.name)))):
@@ -163,14 +163,14 @@ def _gather_and_solve(cameras: Sequence[Camera], out: str, config: Config, engin
                                            'none of its clips exists; check the paths'))
                 tell(camera, None)
             elif camera.name:
-                engine.submit(Task(solve_camera, (camera.name, camera.make, camera.gathered, out,
-                                                  config.replace(camera.known)),
-                                   (camera, None)), first=True)
+                engine.submit(Task(solve_camera, (
+                    camera.name, camera.camera_model, camera.gathered, out,
+                    config.replace(camera.known)), (camera, None)), first=True)
 
 
 def _failed(camera: Camera, error: Exception) -> None:
     camera.own, camera.verdict = None, 'refused'
-    camera.row = tables.failed_row(camera.name, camera.make, camera.clips, error)
+    camera.row = tables.failed_row(camera.name, camera.camera_model, camera.clips, error)
 
 
 def _publish(cameras: Sequence[Camera], found: Mapping[str, lens_prior.ModelPrior], out: str,
@@ -235,13 +235,14 @@ def problems(cameras: Sequence[Camera]) -> Iterator[tuple[Row, str]]:
                 yield row, result.problem
 
 
-def solve_camera(camera: str, make: str, clips: Sequence[tuple[Row, ClipResult]], out: str,
+def solve_camera(camera: str, camera_model: str, clips: Sequence[tuple[Row, ClipResult]], out: str,
                  config: Config) -> CameraResult:
     """Solve a camera from its gathered clips, unless that was done."""
     # a clip that the manifest names twice counts once
     used = {row.name: (result.file, f'{result.content}{row.topic or ""}')
             for row, result in reversed(clips) if result.file}
-    name = solved_file(camera, make, [(clip, *used[clip]) for clip in sorted(used)], config)
+    name = solved_file(
+        camera, camera_model, [(clip, *used[clip]) for clip in sorted(used)], config)
     data = storage.read(storage.joined(out, name))
     again = data is not None
     if data is None:
@@ -254,22 +255,22 @@ def solve_camera(camera: str, make: str, clips: Sequence[tuple[Row, ClipResult]]
                                  f'remove it and start the command again')
             # what was read has this content, whatever it says
             loaded[clip] = replace(found, content=content)
-        data = solved.encoded(fuse(camera, make, loaded, config))
+        data = solved.encoded(fuse(camera, camera_model, loaded, config))
         storage.write(storage.joined(out, name), data)
     result = solved.decoded(data, name)
     return CameraResult(name, result.calibration.verdict.level, result.shares,
                         solved.unit_of(result), again)
 
 
-def solved_file(camera: str, make: str, clips: Sequence[tuple[str, str, str]], config: Config
-                ) -> str:
+def solved_file(camera: str, camera_model: str, clips: Sequence[tuple[str, str, str]],
+                config: Config) -> str:
     """Return the name of a camera's own result. clips: name, file and content of each.
 
     Other clips, other settings and another version of this package have another one.
     """
     settings = {key: value for key, value in config.flat().items() if key != 'workers'}
     version = versions(config.reconstruct)['dashcalib_ros']
-    key = hash_of([solved.FORMAT, version, camera, make, clips, settings])
+    key = hash_of([solved.FORMAT, version, camera, camera_model, clips, settings])
     return f'solved/{key[:2]}/{key}.json'
 
 

@@ -46,7 +46,7 @@ class ClipTurn:
 ROUNDS = 3
 
 
-def fuse(camera: str, make: str, clips: Clips, config: Config) -> Solved:
+def fuse(camera: str, camera_model: str, clips: Clips, config: Config) -> Solved:
     """Calibrate one camera from all its clips, by name; their order does not count.
 
     As in one drive, other stretches than turns are used where turns are few or leave it weak.
@@ -56,13 +56,13 @@ def fuse(camera: str, make: str, clips: Clips, config: Config) -> Solved:
     count, everything = (sum(len(clip.turns) for clip in some.values())
                          for some in (turns, clips))
     if not config.turns.thorough and config.turns.wanted <= count < everything:
-        found = _fused(camera, make, turns, config)
+        found = _fused(camera, camera_model, turns, config)
         if found.calibration.verdict.level != 'weak':
             return found
-    return _fused(camera, make, clips, config)
+    return _fused(camera, camera_model, clips, config)
 
 
-def _fused(camera: str, make: str, clips: Clips, config: Config) -> Solved:
+def _fused(camera: str, camera_model: str, clips: Clips, config: Config) -> Solved:
     clips = dict(sorted(clips.items()))
     left_out = _same_content(clips)
     left_out.update(_other_origins(_without(clips, left_out)))
@@ -92,7 +92,8 @@ def _fused(camera: str, make: str, clips: Clips, config: Config) -> Solved:
         for turn, other in sorted(repeated.items(), reverse=True)})
     shares.update(own)
     shares.update({name: ClipShare.without(why) for name, why in left_out.items()})
-    return Solved(camera, make, calibration, _estimate(solution, origin, config, lines), shares)
+    return Solved(camera, camera_model, calibration,
+                  _estimate(solution, origin, config, lines), shares)
 
 
 def _without(clips: Clips, left_out: Mapping[str, Notice]) -> Clips:

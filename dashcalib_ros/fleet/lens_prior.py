@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What units of one model have in common: a normal distribution of their lenses, from the fleet.
 
-The units of a model, which is called its make here, have nearly the same focal length and
+The units of a camera model have nearly the same focal length and
 distortion (the centre is each unit's own). Each unit is measured with its own covariance S;
 between units the lenses differ by a covariance B, which is estimated by maximum likelihood (EM),
 so that S is not mistaken for B. The spreads below count as some more units. A unit with one turn
@@ -34,14 +34,14 @@ OTHER_MODE = 3.0
 
 @dataclass(frozen=True)
 class Unit:
-    """A camera's own estimate. make: with all that units must share, such as the image size.
+    """A camera's own estimate. camera_model: with all that its units share, such as the size.
 
     lens: (d,) the curvature of the focal length, then the distortion coefficients.
     covariance: (d, d). one_turn: it is made from one turn only.
     """
 
     name: str
-    make: tuple[str, ...]
+    camera_model: tuple[str, ...]
     lens: Floats
     covariance: Floats
     one_turn: bool = False
@@ -78,10 +78,10 @@ FOLDS = 40
 
 
 def priors(units: Sequence[Unit], config: FleetConfig) -> dict[str, ModelPrior]:
-    """Return each unit's prior, from the other units of its make."""
+    """Return each unit's prior, from the other units of its camera model."""
     found: dict[str, ModelPrior] = {}
-    ordered = sorted(units, key=lambda unit: (unit.make, unit.name))
-    for _, group in groupby(ordered, key=lambda unit: unit.make):
+    ordered = sorted(units, key=lambda unit: (unit.camera_model, unit.name))
+    for _, group in groupby(ordered, key=lambda unit: unit.camera_model):
         of_make = list(group)
         folds = min(len(of_make), FOLDS)
         for fold in range(folds):
@@ -102,7 +102,7 @@ def focal_length(curvature: Floats) -> Floats:
     return np.asarray(1 / np.sqrt(-2 * np.asarray(curvature)))
 
 
-# that a unit is in the mode of its make, by its own turns; with less: no prior
+# that a unit is in the mode of its camera model, by its own turns; with less: no prior
 LEAST_ODDS = 3.0
 
 
@@ -123,9 +123,9 @@ def _of_make(unit: Unit, prior: LensPrior | None, others: int, config: FleetConf
 
 
 def odds_of_mode(unit: Unit, prior: LensPrior) -> float:
-    """Return how much likelier a unit's focal length is in the mode of its make than in another.
+    """Return how much likelier a focal length is in the mode of its camera model than in another.
 
-    Another mode may have any focal length from half to twice that of the make.
+    Another mode may have any focal length from half to twice that of the camera model.
     """
     # of the logarithm of the focal length
     slope = -2 * prior.mean[0]
@@ -170,7 +170,7 @@ FOCAL_SPREAD = 0.0125
 
 
 def _densest(focal: Floats, variance: Floats) -> Mask:
-    """Return (n,) the units around the value that most others agree with: the make's main mode.
+    """Return (n,) the units around the value that most others agree with: the main mode.
 
     focal: (n,) curvatures; variance: (n,) of each. A unit that knows little counts little.
     """
@@ -229,13 +229,14 @@ def _fitted(units: Sequence[Unit]) -> LensPrior:
     return LensPrior(mean, between + of_mean, count, excess)
 
 
-def unit_of(name: str, make: str, camera: Camera, covariance: Floats, one_turn: bool) -> Unit:
-    """Return what a camera, with its covariance (n, n), adds to the prior of its make."""
+def unit_of(name: str, camera_model: str, camera: Camera, covariance: Floats, one_turn: bool
+            ) -> Unit:
+    """Return what a camera, with its covariance (n, n), adds to the prior of its camera model."""
     values, slopes = _in_curvatures(camera)
     which = _lens_places(len(values))
     spread = (covariance * np.outer(slopes, slopes))[np.ix_(which, which)]
-    return Unit(name, (make, size_text(camera.image_size), camera.model), values[which], spread,
-                one_turn)
+    return Unit(name, (camera_model, size_text(camera.image_size), camera.model), values[which],
+                spread, one_turn)
 
 
 def conditioned(camera: Camera, covariance: Floats, prior: LensPrior) -> tuple[Camera, Floats]:

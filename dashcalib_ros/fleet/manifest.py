@@ -25,7 +25,9 @@ from dashcalib_ros.limits import MANIFEST_BYTES, MANIFEST_ROWS
 from dashcalib_ros.store.scene_file import LAST_S
 from dashcalib_ros.store.scene_file import SUFFIX as GATHERED
 
-COLUMNS = ('clip', 'camera', 'make', 'fps', 'topic', 'time', 'known', 'temperature', 'rig')
+# columns by their earlier names, which are read, too
+RENAMED = {'make': 'camera_model'}
+COLUMNS = ('clip', 'camera', 'camera_model', 'fps', 'topic', 'time', 'known', 'temperature', 'rig')
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,17 +35,18 @@ class Row:
     """A clip. number: of the manifest's row, from 1. place: its path or URL.
 
     clip: as written, without credentials; place, which may have some, is nowhere shown or kept.
-    camera: '' where it is unknown, then the clip is a camera of its own. make: '' where unknown.
-    time_s: when it was recorded, s since 1970; None where unknown. known: settings known.* of its
-    camera. temperature_c: mean of the clip, degrees Celsius; None where unknown. rig: of the car
-    that its camera is on, '' where unknown. problem: why this row cannot be used, '' if it can.
+    camera: '' where it is unknown, then the clip is a camera of its own. camera_model: '' where
+    unknown. time_s: when it was recorded, s since 1970; None where unknown. known: settings
+    known.* of its camera. temperature_c: mean of the clip, degrees Celsius; None where unknown.
+    rig: of the car that its camera is on, '' where unknown. problem: why this row cannot be used,
+    '' if it can.
     """
 
     number: int
     clip: str
     place: str
     camera: str = ''
-    make: str = ''
+    camera_model: str = ''
     fps: float | None = None
     topic: str | None = None
     time_s: float | None = None
@@ -62,8 +65,8 @@ def read_manifest(place: str, group_by: str | None = None) -> list[Row]:
     """Return the rows of a manifest: .csv, .jsonl, .parquet, a folder or a glob.
 
     group_by: a regular expression that takes the camera from a clip's name: its group `camera`, or
-    its first group, or all that it matches; its group `make`, too. Raises InputError where the
-    manifest cannot be read at all; what is wrong with a row stands in the row.
+    its first group, or all that it matches; its group `camera_model`, too. Raises InputError
+    where the manifest cannot be read at all; what is wrong with a row stands in the row.
     """
     try:
         pattern = None if group_by is None else re.compile(group_by)
@@ -167,7 +170,8 @@ def _parquet(place: str, data: bytes) -> Iterator[Values]:
     if 'clip' not in table.column_names:
         raise InputError('E-MANIFEST-NO-CLIP-COLUMN', f'{place} has no column clip; the columns '
                                                       f'may be {", ".join(COLUMNS)}')
-    yield from table.select([name for name in COLUMNS if name in table.column_names]).to_pylist()
+    yield from table.select([name for name in (*COLUMNS, *RENAMED)
+                             if name in table.column_names]).to_pylist()
 
 
 READERS: dict[str, Callable[[str, bytes], Iterator[Values]]] = {
@@ -177,11 +181,12 @@ READERS: dict[str, Callable[[str, bytes], Iterator[Values]]] = {
 def _row(number: int, values: Values, folder: str) -> Row:
     if isinstance(values, str):
         return Row(number, '', '', problem=values)
-    clip, camera, make, fps, topic, time, known, temperature, rig = (
+    values = {RENAMED.get(name, name): value for name, value in values.items()}
+    clip, camera, camera_model, fps, topic, time, known, temperature, rig = (
         '' if values.get(name) is None else str(values[name]).strip() for name in COLUMNS)
     if not clip:
-        return Row(number, '', '', camera, make, problem='names no clip')
-    row = Row(number, storage.masked(clip), storage.joined(folder, clip), camera, make,
+        return Row(number, '', '', camera, camera_model, problem='names no clip')
+    row = Row(number, storage.masked(clip), storage.joined(folder, clip), camera, camera_model,
               topic=topic or None, rig=rig)
     try:
         return replace(row, fps=_rate(fps) if fps else None, time_s=_time(time) if time else None,
@@ -236,7 +241,7 @@ def _grouped(row: Row, pattern: re.Pattern[str]) -> Row:
     if found is None:
         return row if row.camera else replace(
             row, problem=row.problem or '--group-by matches no camera in the name of the clip')
-    named = found.groupdict()
+    named = {RENAMED.get(name, name): value for name, value in found.groupdict().items()}
     camera = named.get('camera') or (found.group(1) if pattern.groups else found.group(0))
     return replace(row, camera=row.camera or camera or '',
-                   make=row.make or named.get('make') or '')
+                   camera_model=row.camera_model or named.get('camera_model') or '')

@@ -21,8 +21,8 @@ from dashcalib_ros.report.wording import optional
 NAME = 'overview.html'
 # cameras that are listed; the table has all
 LISTED = 2000
-# makes in the plot of focal lengths, and lines in that of drift
-MAKES = 20
+# camera models in the plot of focal lengths, and lines in that of drift
+SHOWN = 20
 # sigmas; a camera drifts beyond so many
 DRIFTS = 3
 # points of such a line
@@ -33,7 +33,7 @@ YEAR_0 = 1970
 NAMED = 10
 # what a column has, where its name does not say it
 TITLES = {
-    'camera model': 'the column make of the manifest',
+    'camera model': 'the column camera_model of the manifest',
     'spread %': 'robust standard deviation of fx between cameras, in % of it',
     'sigma fx %': 'standard deviation (sigma) of fx, in % of it',
     'sigma px': 'standard deviation over the picture, in px, the best rotation removed',
@@ -67,7 +67,7 @@ def overview_html(cameras: Rows, clips: Rows) -> str:
         _sigma_by_turns(cameras), _sigma_by_clips(cameras, clips), _drift(cameras, clips),
         Section('In another sensor mode than other cameras of their model',
                 ('camera', 'camera model', 'why'),
-                [(_link(row), row['make'] or '', row['prior_note'])
+                [(_link(row), row['camera_model'] or '', row['prior_note'])
                  for row in cameras if row['other_mode']]),
         _reasons('Clips that are not used', 'clips', [
             (row['code'], row['reason'], row['clip'] or f'row {row["row"]}')
@@ -93,29 +93,30 @@ def duration(seconds: float) -> str:
 
 
 def _makes(cameras: Rows) -> Section:
-    makes: dict[str, list[Mapping[str, Any]]] = {}
+    models: dict[str, list[Mapping[str, Any]]] = {}
     for row in cameras:
         if row['fx']:
-            makes.setdefault(f'{row["make"] or "unknown"}, {row["width"]} px', []).append(row)
+            name = f'{row["camera_model"] or "unknown"}, {row["width"]} px'
+            models.setdefault(name, []).append(row)
     rows = []
-    for make, known in sorted(makes.items()):
+    for model, known in sorted(models.items()):
         values = np.array([row['fx'] for row in known])
         middle = float(np.median(values))
         spread = 1.4826 * float(np.median(np.abs(values - middle)))
-        rows.append((make, len(known), f'{middle:.1f}', f'{100 * spread / middle:.2f}'))
+        rows.append((model, len(known), f'{middle:.1f}', f'{100 * spread / middle:.2f}'))
     return Section('Focal lengths by camera model',
                    ('camera model', 'cameras', 'median fx, px', 'spread %'), rows,
-                   *_fx_by_make(makes) if rows else ())
+                   *_fx_by_camera_model(models) if rows else ())
 
 
-def _fx_by_make(makes: Mapping[str, Rows]) -> tuple[str, str]:
-    shown = sorted(makes, key=lambda make: (-len(makes[make]), make))[:MAKES]
-    low, high = _ends([row['fx'] for make in shown for row in makes[make]])
+def _fx_by_camera_model(models: Mapping[str, Rows]) -> tuple[str, str]:
+    shown = sorted(models, key=lambda model: (-len(models[model]), model))[:SHOWN]
+    low, high = _ends([row['fx'] for model in shown for row in models[model]])
     axes = Axes(900, 70 + 26 * len(shown), (low, high), (0.5 - len(shown), 0.5), left=190)
     parts = [axes.frame('fx, px', '', ticks(low, high), ())]
-    for n, make in enumerate(sorted(shown)):
-        parts.append(text(180, float(axes.down(-n)) + 4, shortened(make, 26), 'end'))
-        parts.append(_dots(axes, [(row['fx'], -n, row['verdict']) for row in makes[make]]))
+    for n, model in enumerate(sorted(shown)):
+        parts.append(text(180, float(axes.down(-n)) + 4, shortened(model, 26), 'end'))
+        parts.append(_dots(axes, [(row['fx'], -n, row['verdict']) for row in models[model]]))
     return _figure('fx of each camera, by camera model and image width', axes, parts)
 
 
@@ -185,7 +186,7 @@ def _drift(cameras: Rows, clips: Rows) -> Section:
     drifting = sorted((name for name, line in lines.items()
                        if name in warm or abs(line.size[0]) > DRIFTS * line.sigma[0]),
                       key=lambda name: -abs(lines[name].size[0]))
-    for name in drifting[:MAKES]:
+    for name in drifting[:SHOWN]:
         line = lines[name]
         years = [year for year, _, each in found if each == name]
         if not years:
@@ -245,7 +246,7 @@ def _names(names: Sequence[str]) -> str:
 
 
 def _listed(cameras: Rows) -> Section:
-    rows = [(_link(row), row['make'] or '', row['verdict'], row['model'] or '-',
+    rows = [(_link(row), row['camera_model'] or '', row['verdict'], row['model'] or '-',
              optional(row['fx'], 1),
              '-' if row['fx'] is None else f'{100 * row["sigma_fx"] / row["fx"]:.2f}',
              optional(row['sigma_px'], 2),

@@ -22,7 +22,7 @@ from dashcalib_ros.judge.calibration import Condition
 from dashcalib_ros.solve.spread import PictureSigma
 
 # of the JSON text
-FORMAT = 5
+FORMAT = 6
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Solved:
     """
 
     camera: str
-    make: str
+    camera_model: str
     calibration: CalibrationData
     estimate: Estimate | None
     shares: Mapping[str, ClipShare]
@@ -88,7 +88,7 @@ def encoded(solved: Solved) -> bytes:
     """Return the JSON text; the same result gives the same bytes."""
     estimate = solved.estimate
     return json.dumps({
-        'camera': solved.camera, 'make': solved.make, 'shares': solved.shares,
+        'camera': solved.camera, 'camera_model': solved.camera_model, 'shares': solved.shares,
         'estimate': None if estimate is None else {**vars(estimate), 'camera': (
             estimate.camera.model, estimate.camera.image_size, estimate.camera.params)},
         # the prior moves the camera, and these are of the one before
@@ -113,7 +113,7 @@ def decoded(data: bytes, name: str) -> Solved:
             # in which what is not known is infinite
             calibration = replace(calibration, sigma=estimate.sigma, sigma_px=estimate.sigma_px)
         return Solved(
-            content['camera'], content['make'], calibration, estimate,
+            content['camera'], content['camera_model'], calibration, estimate,
             {clip: ClipShare(**share) for clip, share in content['shares'].items()})
     except Exception as error:  # damaged files raise errors of all kinds
         raise InputError('E-FLEET-FILE-DAMAGED',
@@ -152,11 +152,12 @@ class Final:
 def unit_of(solved: Solved) -> Unit | None:
     """Return what a camera adds to the prior of its model; None where it cannot be trusted."""
     estimate = solved.estimate
-    if (estimate is None or not solved.make or not estimate.sound
+    if (estimate is None or not solved.camera_model or not estimate.sound
             or not np.isfinite(estimate.of_its_noise).all()):
         return None
-    return lens_prior.unit_of(solved.camera, solved.make, estimate.camera, estimate.of_its_noise,
-                              sum(share.used for share in solved.shares.values()) == 1)
+    return lens_prior.unit_of(
+        solved.camera, solved.camera_model, estimate.camera, estimate.of_its_noise,
+        sum(share.used for share in solved.shares.values()) == 1)
 
 
 def final_of(solved: Solved, found: ModelPrior | None) -> Final:
@@ -164,12 +165,13 @@ def final_of(solved: Solved, found: ModelPrior | None) -> Final:
     own = solved.calibration
     if found is None:
         return Final(own, prior_note='its own turns give no estimate to combine with a prior'
-                     if solved.make else 'the model of the camera is unknown (column make)')
+                     if solved.camera_model else
+                     'the model of the camera is unknown (column camera_model)')
     if found.prior is not None:
         return _with_prior(solved, found.prior)
     if found.other_mode:
         own = replace(own, warnings=(*own.warnings, Notice(
-            'E-PRIOR-OTHER-MODE', f'camera model {solved.make}: {found.why_not}')))
+            'E-PRIOR-OTHER-MODE', f'camera model {solved.camera_model}: {found.why_not}')))
     return Final(own, prior_note=found.why_not, other_mode=found.other_mode)
 
 
@@ -181,27 +183,27 @@ def _with_prior(solved: Solved, prior: LensPrior) -> Final:
     share = float(1 - covariance[0, 0] / own_covariance[0, 0]
                   * (estimate.camera.fx / camera.fx)**2)
     calibration = replace(
-        own, verdict=_verdict(own, solved.make, camera, covariance, prior, share),
+        own, verdict=_verdict(own, solved.camera_model, camera, covariance, prior, share),
         camera=camera, sigma=sigmas(camera, covariance),
         reprojection_error_px=estimate.reprojection_error_px,
         sigma_px=_picture_sigma(camera, covariance, estimate.sigma_px),
         covariance=covariance, picture_covariance=covariance,
         details={**own.details, 'prior': {
-            'make': solved.make, 'units': prior.units, 'share_of_fx': share,
+            'camera_model': solved.camera_model, 'units': prior.units, 'share_of_fx': share,
             'fx_alone': estimate.camera.fx, 'sigma_alone': estimate.sigma}})
     return Final(calibration, prior.units, share)
 
 
-def _verdict(own: CalibrationData, make: str, camera: Camera, covariance: Floats, prior: LensPrior,
-             share: float) -> Verdict:
+def _verdict(own: CalibrationData, camera_model: str, camera: Camera, covariance: Floats,
+             prior: LensPrior, share: float) -> Verdict:
     """Return the verdict with a prior: it never makes a result accepted."""
     if own.verdict.level == 'accepted':
         return own.verdict
     sigma = 100 * float(np.sqrt(covariance[0, 0])) / camera.fx
     why = Notice(
         'E-PRIOR-USED', f'{100 * share:.0f} % of the information about fx comes from the prior of '
-        f'the camera model {make} ({prior.units} other cameras), the rest from its own turns; '
-        f'sigma of fx with it: {sigma:.1f} %')
+        f'the camera model {camera_model} ({prior.units} other cameras), the rest from its own '
+        f'turns; sigma of fx with it: {sigma:.1f} %')
     return Verdict('weak', (why, *(
         Notice(each.code, f'without the prior: {each}') for each in own.verdict.reasons)),
         (Condition(why.code, why, '', '', False), *own.verdict.conditions))

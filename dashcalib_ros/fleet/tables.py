@@ -40,7 +40,7 @@ FORMULA = ('=', '+', '-', '@')
 
 # each column's type
 CAMERA_COLUMNS = {
-    **dict.fromkeys(('camera', 'make', 'verdict', 'verdict_alone', 'model'), 'text'),
+    **dict.fromkeys(('camera', 'camera_model', 'verdict', 'verdict_alone', 'model'), 'text'),
     **dict.fromkeys(('width', 'height'), 'number'),
     **dict.fromkeys(PARAMETERS, 'real'),
     **{f'sigma_{name}': 'real' for name in PARAMETERS},
@@ -57,7 +57,7 @@ CAMERA_COLUMNS = {
     **dict.fromkeys(('reasons', 'reason_codes', 'warnings'), 'texts'), 'folder': 'text'}
 CLIP_COLUMNS = {
     'row': 'number',
-    **dict.fromkeys(('clip', 'camera', 'make', 'status', 'reason', 'code'), 'text'),
+    **dict.fromkeys(('clip', 'camera', 'camera_model', 'status', 'reason', 'code'), 'text'),
     'width': 'number', 'height': 'number', 'frames': 'number', 'seconds': 'real',
     **dict.fromkeys(('turns', 'scenes', 'turns_used'), 'number'),
     **dict.fromkeys(('fx', 'sigma_fx_noise', 'sigma_fx_so_far', 'time', 'temperature_c'),
@@ -69,7 +69,7 @@ def camera_row(solved: Solved, final: Final, clips: Sequence[Mapping[str, Any]])
     """Return the row of a camera. clips: the rows of its clips."""
     c, estimate = final.calibration, solved.estimate
     row = {
-        **failed_row(solved.camera, solved.make, clips), 'verdict': c.verdict.level,
+        **failed_row(solved.camera, solved.camera_model, clips), 'verdict': c.verdict.level,
         'verdict_alone': solved.calibration.verdict.level,
         'width': c.image_size[0] or None, 'height': c.image_size[1] or None,
         'reprojection_error_px': c.reprojection_error_px, 'prior_units': final.prior_units,
@@ -92,13 +92,13 @@ def camera_row(solved: Solved, final: Final, clips: Sequence[Mapping[str, Any]])
     return row
 
 
-def failed_row(camera: str, make: str, clips: Sequence[Mapping[str, Any]],
+def failed_row(camera: str, camera_model: str, clips: Sequence[Mapping[str, Any]],
                why: Exception | str = '') -> dict[str, Any]:
     """Return the row of a camera without a result: of its clips, and why there is none."""
     drift = drift_of(clips)
     count = Counter(row['status'] for row in clips)
     return {
-        **dict.fromkeys(CAMERA_COLUMNS), 'camera': camera, 'make': make or None,
+        **dict.fromkeys(CAMERA_COLUMNS), 'camera': camera, 'camera_model': camera_model or None,
         'verdict': 'refused', 'verdict_alone': 'refused', 'clips': len(clips),
         'clips_used': count['used'], 'clips_left_out': count['left out'],
         'clips_unreadable': count['unreadable'], 'turns': sum(row['turns'] for row in clips),
@@ -121,7 +121,7 @@ def folder_name(name: str) -> str:
     return name if plain == name and not HASHED.search(name) else f'{plain}-{hash_of([name])}'
 
 
-def clip_rows(camera: str, make: str, clips: Sequence[tuple[Row, ClipResult]],
+def clip_rows(camera: str, camera_model: str, clips: Sequence[tuple[Row, ClipResult]],
               shares: Mapping[str, ClipShare]) -> list[dict[str, Any]]:
     """Return the rows of a camera's clips. shares: by name; a clip named twice counts once."""
     first: dict[str, int] = {}
@@ -137,7 +137,7 @@ def clip_rows(camera: str, make: str, clips: Sequence[tuple[Row, ClipResult]],
                      if time is not None and time > DATES_S), None)
         found.append({
             **vars(result), 'row': row.number, 'clip': row.clip, 'camera': camera,
-            'make': make or None, 'status': status, 'reason': reason, 'code': code,
+            'camera_model': camera_model or None, 'status': status, 'reason': reason, 'code': code,
             'turns_used': share.used, 'fx': share.fx, 'sigma_fx_noise': share.fx_sigma,
             'sigma_fx_so_far': share.sigma_so_far, 'time': time,
             'temperature_c': row.temperature_c})

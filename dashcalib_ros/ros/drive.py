@@ -115,7 +115,7 @@ class Drive:
         self._preview = Preview(
             endpoints, own, core.rectified,
             lambda error: self._later(partial(self.survive, error, 'preview')))
-        self._intake = Intake(core.motion.rate, self._complaints, self._on_source)
+        self._intake = Intake(core.tracking.rate, self._complaints, self._on_source)
         self._video = None
         if own.image_transport == 'video':
             self._video = VideoDecoding(

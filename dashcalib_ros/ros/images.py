@@ -36,8 +36,8 @@ T = TypeVar('T')
 
 CURES = {
     'lost': 'images are lost between the camera and this node (gaps in the stamps)',
-    'dropped': 'images are dropped because detection does not keep up: lower motion.rate, '
-               'motion.width or motion.points',
+    'dropped': 'images are dropped because detection does not keep up: lower tracking.rate, '
+               'tracking.width or tracking.points',
     'repeated': 'images have stamps that are not later than those before: check for a second '
                 'publisher on the topic',
     'unstamped': 'some images have no stamp, and others have one: fix the camera driver',

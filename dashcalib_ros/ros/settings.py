@@ -73,7 +73,7 @@ PURPOSES = {
          'store, publishes static transforms once a rig is accepted, and names a camera that was '
          'moved since.'}
 # settings of the core that are most often set
-CORE = ('model', 'rectified', 'turns.wanted', 'turns.store', 'motion.rate', 'verdict.max_sigma')
+CORE = ('model', 'rectified', 'turns.wanted', 'turns.store', 'tracking.rate', 'verdict.max_sigma')
 
 
 @dataclass(frozen=True)

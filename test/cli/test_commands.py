@@ -228,7 +228,7 @@ def test_flags_win_over_set_which_wins_over_the_file(fake, drive, tmp_path):
     assert main(['run', drive, '--config', str(path), '--set', 'turns.wanted=3', '--set',
                  'turns.half_width=1e0', '--turns', '4', '--workers', '2', '--verbose']) == 0
     wanted = Config().replace({'turns.wanted': 4, 'turns.at_most': 4, 'turns.half_width': 1.0,
-                               'seed': 3, 'motion.standing_px': 0.2, 'workers': 2})
+                               'seed': 3, 'tracking.standing_px': 0.2, 'workers': 2})
     assert fake.made[0].config == wanted and fake.made[0].verbose
     # its earlier name
     assert main(['run', drive, '--threads', '3']) == 0

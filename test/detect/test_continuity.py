@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from synthetic import rotation
 
-from dashcalib_ros.config import MotionConfig
+from dashcalib_ros.config import TrackingConfig
 from dashcalib_ros.demo import Drive, DriveSpec, Lens
 from dashcalib_ros.detect import MotionEstimator
 from dashcalib_ros.detect.continuity import goes_on
@@ -96,7 +96,7 @@ STEP = 100_000_000
 
 def motions(frames, joints=(), first=0, step_ns=STEP):
     """Return the motions; images at these positions are perhaps after a gap."""
-    estimator = MotionEstimator(MotionConfig())
+    estimator = MotionEstimator(TrackingConfig())
     return [estimator.push(Frame(first + n, (first + n) * step_ns, frame.image,
                                  perhaps_after_gap=n in joints))
             for n, frame in enumerate(frames)]
@@ -136,7 +136,7 @@ def test_a_loss_is_a_gap(frames, at, lost):
 
 
 def test_the_first_image_of_a_file_may_be_skipped(frames):
-    """As the camera is faster than motion.rate: the next image answers."""
+    """As the camera is faster than tracking.rate: the next image answers."""
     whole = motions(frames, step_ns=STEP // 3)
     assert sum(motion is not None for motion in whole) == 12
     for at in (12, 13, 14):
@@ -147,7 +147,7 @@ def test_the_first_image_of_a_file_may_be_skipped(frames):
 
 
 def test_a_known_gap_is_one_whatever_the_pictures_show(frames):
-    estimator = MotionEstimator(MotionConfig())
+    estimator = MotionEstimator(TrackingConfig())
     found = [estimator.push(dataclasses.replace(
         frame, after_gap=frame.index == 8, perhaps_after_gap=frame.index == 8))
         for frame in frames[:12]]

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dashcalib_ros.config import MaskConfig, MotionConfig
+from dashcalib_ros.config import MaskConfig, TrackingConfig
 from dashcalib_ros.demo import Drive, DriveSpec, Lens
 from dashcalib_ros.detect import MotionEstimator
 from dashcalib_ros.detect.mask import EgoMask
@@ -21,7 +21,7 @@ KITTI = Path(__file__).parents[3] / 'shared/data/kitti03/bag'
 
 
 def observe(frames, valid=None, **mask):
-    estimator = MotionEstimator(MotionConfig(), MaskConfig(**mask), valid)
+    estimator = MotionEstimator(TrackingConfig(), MaskConfig(**mask), valid)
     for frame in frames:
         estimator.push(frame)
     return estimator.valid()

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from refused import refused
 
-from dashcalib_ros.config import Config, MaskConfig, MotionConfig
+from dashcalib_ros.config import Config, MaskConfig, TrackingConfig
 from dashcalib_ros.demo import Drive, DriveSpec, Lens, Stop, Turn
 from dashcalib_ros.detect import MotionEstimator, TurnDetector
 from dashcalib_ros.detect import estimator as estimator_module
@@ -86,7 +86,7 @@ def test_no_epipoles_from_chance():
 
 def kept(stamps_ns: np.ndarray, **changes: float) -> list[int]:
     """Return which frames of a camera with these stamps are processed."""
-    estimator = MotionEstimator(MotionConfig(**changes), MaskConfig(enabled=False))
+    estimator = MotionEstimator(TrackingConfig(**changes), MaskConfig(enabled=False))
     image = np.zeros((48, 64), np.uint8)
     motions = [estimator.push(Frame(i, int(ns), image)) for i, ns in enumerate(stamps_ns)]
     return [motion.index for motion in motions if motion is not None]
@@ -124,7 +124,7 @@ def test_clock_set_back_and_the_next_file_start_anew(stopping_frames, shift_ns, 
     frames = stopping_frames[:14]
     frames += [dataclasses.replace(f, index=f.index + 14, stamp_ns=f.stamp_ns + shift_ns,
                                    after_gap=after_gap and f.index == 0) for f in frames]
-    estimator = MotionEstimator(MotionConfig())
+    estimator = MotionEstimator(TrackingConfig())
     motions = [estimator.push(frame) for frame in frames]
     assert all(motion is not None for motion in motions)
     assert [m.center for m in motions[:8]] == [None] * 6 + [3, 4]
@@ -141,7 +141,7 @@ def test_clock_set_back_and_the_next_file_start_anew(stopping_frames, shift_ns, 
     np.zeros((4, 4), np.uint8), np.zeros((1, 1), np.uint8),
     np.random.default_rng(0).integers(0, 255, (120, 160)).astype(np.uint8)])
 def test_pictures_without_motion_give_no_turns(image):
-    estimator = MotionEstimator(MotionConfig())
+    estimator = MotionEstimator(TrackingConfig())
     for index in range(12):
         motion = estimator.push(Frame(index, index * 10**8, image))
         assert not motion.magnitude > 0
@@ -150,20 +150,20 @@ def test_pictures_without_motion_give_no_turns(image):
 
 def test_noise_alone_is_no_motion():
     rng = np.random.default_rng(0)
-    estimator = MotionEstimator(MotionConfig())
+    estimator = MotionEstimator(TrackingConfig())
     for index in range(12):
         image = rng.integers(0, 255, (120, 160)).astype(np.uint8)
         assert not estimator.push(Frame(index, index * 10**8, image)).magnitude > 0
 
 
 def test_user_mask_must_fit_and_hides(stopping_frames):
-    wrong = MotionEstimator(MotionConfig(), valid=np.ones((270, 479), bool))
+    wrong = MotionEstimator(TrackingConfig(), valid=np.ones((270, 479), bool))
     frame = stopping_frames[0]
     with refused(InputError, 'E-MASK-SIZE', '479x270', '480x270'):
         wrong.push(frame)
     valid = np.zeros((270, 480), bool)
     valid[:, :200] = True
-    estimator = MotionEstimator(MotionConfig(), valid=valid)
+    estimator = MotionEstimator(TrackingConfig(), valid=valid)
     assert estimator.push(frame).points == 0
     assert len(estimator._xy) > 0 and estimator._xy[:, 0].max() < 202
     assert np.array_equal(estimator.valid(), valid)
@@ -173,7 +173,7 @@ def test_user_mask_must_fit_and_hides(stopping_frames):
 
 def detect(frames, config=None):
     config = config or Config()
-    estimator = MotionEstimator(config.motion, config.mask)
+    estimator = MotionEstimator(config.tracking, config.mask)
     detector = TurnDetector(config.turns)
     motions = []
     for frame in frames:
@@ -221,7 +221,7 @@ def test_size_of_the_picture_hardly_matters(stopping, stopping_frames):
     """Magnitudes are relative to the width, whatever is tracked on."""
     part = stopping_frames[stopping.turn_centers[0] - 25:][:40]
     whole, _ = detect(part)
-    small, _ = detect(part, Config().replace({'motion.width': 240}))
+    small, _ = detect(part, Config().replace({'tracking.width': 240}))
     a, b = (np.array([m.magnitude for m in ms if m.center]) for ms in (whole, small))
     assert np.nanmedian(np.abs(a - b)) < 0.02 * np.nanmax(a)
 

@@ -143,11 +143,11 @@ def test_it_ends_with_the_second_camera(pictures):
 def test_the_node_sees_what_the_command_sees(pictures, rate, pattern):
     """The node thins the images before they are decoded: one a second more is let through."""
     both = frames(pictures * 2, pattern, mirrored, rate)
-    gate, live = StampGate(Config().motion.rate), Detection(Config())
+    gate, live = StampGate(Config().tracking.rate), Detection(Config())
     passed = [frame for frame in both if gate.take(frame.stamp_ns + 1, 0) is not None]
     for frame in passed:
         live.push(frame)
-    used = both[-1].stamp_ns / 1e9 * Config().motion.rate
+    used = both[-1].stamp_ns / 1e9 * Config().tracking.rate
     assert len(passed) < 1.4 * used
     assert live.other_camera == detect(both, Config()).other_camera is not None
 

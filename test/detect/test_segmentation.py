@@ -14,7 +14,7 @@ from refused import refused
 
 from dashcalib_ros import Calibrator, Config
 from dashcalib_ros.cli import main
-from dashcalib_ros.config import MaskConfig, MotionConfig
+from dashcalib_ros.config import MaskConfig, TrackingConfig
 from dashcalib_ros.detect import MotionEstimator
 from dashcalib_ros.detect.segmentation import (
     IMAGES,
@@ -128,7 +128,7 @@ def test_what_is_not_believed_or_not_there_is_said(dark):
 
 
 def test_only_a_car_that_moves_asks(dark):
-    estimator = MotionEstimator(MotionConfig(), MaskConfig(enabled=False, segmentation=dark))
+    estimator = MotionEstimator(TrackingConfig(), MaskConfig(enabled=False, segmentation=dark))
     [first, *_] = street(1)
     first.image[230:] = 0
     for k in range(50):
@@ -150,7 +150,8 @@ def test_masks_in_all_combinations(tmp_path, user, automatic, model):
     for frame in frames:
         frame.image[-60:, 240:400] = cv2.blur(text, (3, 3))  # keeps its place
     estimator = MotionEstimator(
-        MotionConfig(), MaskConfig(enabled=automatic, segmentation=path), given if user else None)
+        TrackingConfig(), MaskConfig(enabled=automatic, segmentation=path),
+        given if user else None)
     for frame in frames:
         estimator.push(frame)
     valid = estimator.valid()
@@ -167,7 +168,7 @@ def test_masks_in_all_combinations(tmp_path, user, automatic, model):
 
 
 def test_pictures_of_another_size_are_asked_about_anew(dark):
-    estimator = MotionEstimator(MotionConfig(), MaskConfig(enabled=False, segmentation=dark))
+    estimator = MotionEstimator(TrackingConfig(), MaskConfig(enabled=False, segmentation=dark))
     for frame in street(20):
         frame.image[230:] = 0
         estimator.push(frame)
@@ -179,7 +180,7 @@ def test_pictures_of_another_size_are_asked_about_anew(dark):
 
 def test_a_users_mask_of_another_size_is_refused_as_before(dark):
     config = MaskConfig(segmentation=dark)
-    estimator = MotionEstimator(MotionConfig(), config, np.ones((8, 8), bool))
+    estimator = MotionEstimator(TrackingConfig(), config, np.ones((8, 8), bool))
     with pytest.raises(InputError):
         estimator.push(street(1)[0])
 
@@ -286,7 +287,7 @@ def test_without_the_runtime_the_cure_is_named(drive, tmp_path, monkeypatch, cap
 
 def test_the_runtime_is_not_loaded_without_a_model(monkeypatch):
     monkeypatch.setitem(sys.modules, 'onnxruntime', None)
-    MotionEstimator(MotionConfig())
+    MotionEstimator(TrackingConfig())
 
 
 @pytest.mark.parametrize('classes', [13, '13', '63,64', '63, 64'])

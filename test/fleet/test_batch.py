@@ -79,7 +79,7 @@ class Counting(Here):
 
 @pytest.fixture(scope='module')
 def manifest(tmp_path_factory):
-    """Five cameras of a make with a turn each, one with two; one without turns; two bad clips."""
+    """Five cameras of a model with a turn each, one with two; one without turns; two bad clips."""
     pytest.importorskip('pyarrow')
     folder = tmp_path_factory.mktemp('fleet')
     rows = []
@@ -94,7 +94,7 @@ def manifest(tmp_path_factory):
              ['empty.mp4', 'cam 1', 'acme'], ['gone.mp4', 'cam 5', 'acme'],
              ['0.npz', 'cam 0', 'acme']]
     with (folder / 'm.csv').open('w', newline='') as stream:
-        csv.writer(stream).writerows([['clip', 'camera', 'make'], *rows])
+        csv.writer(stream).writerows([['clip', 'camera', 'camera_model'], *rows])
     return folder / 'm.csv'
 
 

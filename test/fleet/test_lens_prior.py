@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The prior of a make: from units that know little, it learns what they share."""
+"""The prior of a camera model: from units that know little, it learns what they share."""
 from __future__ import annotations
 
 from dataclasses import replace
@@ -33,7 +33,7 @@ SPREAD = np.diag([0.01 * SLOPE, 0.003, 0.003])**2
 
 
 def fleet(seed, count=30, sigma=0.03, zooms=(), excess=1.0):
-    """Return units of one make, and the truth of each; each knows fx to its own sigma."""
+    """Return units of one camera model, and the truth of each; each knows fx to its own sigma."""
     rng = np.random.default_rng(seed)
     units, truths = [], []
     for n in range(count + len(zooms)):
@@ -137,18 +137,18 @@ def test_a_units_own_data_are_not_used_twice():
 def test_few_units_give_no_prior():
     units, _ = fleet(5, CONFIG.least_units)
     assert f'needs {CONFIG.least_units}' in priors(units, CONFIG)['u000'].why_not
-    other = [replace(unit, make=('other', '800x450', 'radial')) for unit in units]
+    other = [replace(unit, camera_model=('other', '800x450', 'radial')) for unit in units]
     assert all(each.prior is None for each in priors([*units[1:], *other[:1]], CONFIG).values())
 
 
-def solved_unit(level='weak', make='acme', sigma=15.0, sound=True):
+def solved_unit(level='weak', camera_model='acme', sigma=15.0, sound=True):
     camera = Radial((800, 450), 540.0, 541.0, 400.0, 220.0, -0.27, 0.08)
     covariance = np.diag([sigma, sigma, 2.0, 2.0, 0.01, 0.02])**2
     covariance[0, 1] = covariance[1, 0] = 0.99 * sigma**2
     calibration = Calibration(
         Verdict(level, () if level == 'accepted' else (Notice('', 'too little yaw'),)), (800, 450),
         None if level == 'refused' else camera, None, (), 100, 0.2, {}, {}, _config())
-    return Solved('cam', make, calibration,
+    return Solved('cam', camera_model, calibration,
                   Estimate(camera, 4 * covariance, covariance, PictureSigma(9.0, 20.0), 0.2,
                            sound),
                   {'a': ClipShare(1)})
@@ -188,8 +188,9 @@ def test_an_accepted_camera_stays_accepted_and_hardly_moves():
 
 
 def test_where_there_is_no_prior_it_says_why():
-    assert unit_of(solved_unit(make='')) is None and unit_of(solved_unit(sound=False)) is None
-    assert 'unknown' in final_of(solved_unit(make=''), None).prior_note
+    assert unit_of(solved_unit(camera_model='')) is None
+    assert unit_of(solved_unit(sound=False)) is None
+    assert 'unknown' in final_of(solved_unit(camera_model=''), None).prior_note
     thrown = final_of(solved_unit(), ModelPrior(None, 'its fx is off: another mode', True))
     assert thrown.other_mode and thrown.calibration.warnings[0].code == 'E-PRIOR-OTHER-MODE'
     assert thrown.calibration.camera.fx == 540.0

@@ -19,12 +19,12 @@ def rows_of(tmp_path, text, name='m.csv', **options):
 
 
 def test_a_csv_names_clips_relative_to_itself(tmp_path):
-    text = ('\ufeffClip, camera ,make,fps,topic,time,notes\r\n'
+    text = ('\ufeffClip, camera ,camera_model,fps,topic,time,notes\r\n'
             'a/1.mp4,cam,acme,12.5,/image,2026-01-31T12:00:00,"x, y"\r\n\r\n'
             '/abs/2.mp4\r\ns3://bucket/3.mp4,cam\r\n')
     one, two, three = rows_of(tmp_path, text)
     assert (one.number, one.clip, one.place) == (1, 'a/1.mp4', str(tmp_path / 'a/1.mp4'))
-    assert (one.camera, one.make, one.fps, one.topic) == ('cam', 'acme', 12.5, '/image')
+    assert (one.camera, one.camera_model, one.fps, one.topic) == ('cam', 'acme', 12.5, '/image')
     assert one.time_s == 1769860800.0 and not one.problem
     assert (two.number, two.place, two.camera, two.fps) == (2, '/abs/2.mp4', '', None)
     assert three.place == 's3://bucket/3.mp4'
@@ -144,9 +144,14 @@ def test_folders_and_globs_in_the_order_of_their_names(tmp_path):
 
 def test_the_camera_from_the_name(tmp_path):
     text = 'clip,camera\nacme/cam7/1.mp4,\nacme/cam7/2.mp4,own\nother.mp4,\n'
-    grouped = rows_of(tmp_path, text, group_by=r'(?P<make>\w+)/(?P<camera>cam\d)')
-    assert [(row.camera, row.make) for row in grouped[:2]] == [('cam7', 'acme'), ('own', 'acme')]
+    grouped = rows_of(tmp_path, text, group_by=r'(?P<camera_model>\w+)/(?P<camera>cam\d)')
+    assert [(row.camera, row.camera_model) for row in grouped[:2]] == [
+        ('cam7', 'acme'), ('own', 'acme')]
     assert '--group-by' in grouped[2].problem
+    # and by the earlier name of the group, as of the column
+    earlier = rows_of(tmp_path, text, group_by=r'(?P<make>\w+)/(?P<camera>cam\d)')
+    assert earlier[0].camera_model == 'acme'
+    assert rows_of(tmp_path, 'clip,make\n1.mp4,acme\n')[0].camera_model == 'acme'
     assert rows_of(tmp_path, text, group_by=r'cam(\d)')[0].camera == '7'
     assert rows_of(tmp_path, text, group_by=r'cam\d')[0].camera == 'cam7'
     with pytest.raises(ConfigError) as caught:

@@ -144,9 +144,9 @@ def drawn_fleet():
     times = START_S + np.arange(5) * tables.YEAR_S / 2
     clips = rows_at(times, 1000 * (1 + 0.05 * np.arange(5)), sigma=1.0)
     failed = failed_row('cam', 'acme', clips, 'failed')
-    cameras = [{**failed, 'camera': name, 'make': make, 'verdict': verdict, 'fx': fx,
+    cameras = [{**failed, 'camera': name, 'camera_model': model, 'verdict': verdict, 'fx': fx,
                 'width': 1280, 'sigma_fx': 5.0, 'turns_used': turns}
-               for turns, (name, make, verdict, fx) in enumerate((
+               for turns, (name, model, verdict, fx) in enumerate((
                    ('cam', 'acme', 'accepted', 1100.0), ('two', 'acme', 'weak', 1000.0),
                    ('<b>three', '', 'weak', 900.0)))]
     return overview_html([*cameras, {**failed, 'camera': 'none'}], clips)

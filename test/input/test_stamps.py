@@ -65,7 +65,7 @@ def test_one_zero_among_stamps_is_left_out():
 def test_thinning_takes_what_the_motion_estimator_takes(rate):
     rng = np.random.default_rng(int(rate))
     config = Config()
-    gate, estimator = StampGate(config.motion.rate), MotionEstimator(config.motion)
+    gate, estimator = StampGate(config.tracking.rate), MotionEstimator(config.tracking)
     image = np.zeros((48, 64), np.uint8)
     stamps = [START + round(n * SECOND / rate + rng.uniform(-5e6, 5e6)) for n in range(60)]
     stamps += [stamp - 3000 * SECOND for stamp in stamps]  # a bag that loops
@@ -73,7 +73,7 @@ def test_thinning_takes_what_the_motion_estimator_takes(rate):
             if gate.take(stamp, 0) is not None]
     theirs = [motion.index for n, stamp in enumerate(stamps)
               if (motion := estimator.push(Frame(n, stamp, image)))]
-    again = MotionEstimator(config.motion)
+    again = MotionEstimator(config.tracking)
     assert theirs == [frame.index for frame in mine if again.push(frame)]
     # one a second of the others is looked at
     assert 0 <= len(mine) - len(theirs) <= 2 * 60 / rate + 2

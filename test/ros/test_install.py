@@ -117,11 +117,11 @@ def test_a_parameter_may_have_its_earlier_name(ros_context):
 
 def test_a_file_may_have_full_names_or_sections(tmp_path, ros_context):
     path = tmp_path / 'parameters.yaml'
-    path.write_text('/**:\n  ros__parameters:\n    turns.wanted: 3\n    motion.rate: 8.0\n'
+    path.write_text('/**:\n  ros__parameters:\n    turns.wanted: 3\n    tracking.rate: 8.0\n'
                     '    turns:\n      at_most: 4\n')
     settings, _ = read(['--params-file', str(path)])
     assert settings.core == Config().replace(
-        {'turns.wanted': 3, 'motion.rate': 8.0, 'turns.at_most': 4})
+        {'turns.wanted': 3, 'tracking.rate': 8.0, 'turns.at_most': 4})
 
 
 def test_an_empty_list_of_another_node_is_left_alone(ros_context):

@@ -65,7 +65,7 @@ def test_the_state_is_written_on_a_bar_and_fits(size):
 
 def test_points_are_told_in_pixels_of_the_input():
     """Of a picture that is enlarged for the search, and shrunk again for the tracking."""
-    config = Config().replace({'min_width': 640, 'motion.width': 320})
+    config = Config().replace({'min_width': 640, 'tracking.width': 320})
     with Calibrator(config) as calibrator:
         wide = texture((400, 240))
         for n in range(8):
