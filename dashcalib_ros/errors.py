@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """All errors that a user can cause. The core raises them; only the borders (cli, ros) catch them.
 
-Each has a code and one line of text with the problem and its cure, and so have warnings.
+Each has a code and one line of text with the problem and its remedy, and so have warnings.
 docs/messages.md lists them.
 """
 from __future__ import annotations
@@ -88,7 +88,7 @@ class DashcalibError(Exception):
     """Root of all errors that this package raises on purpose.
 
     code: identifies the problem, such as E-FILE-EMPTY. It does not change when the text does: use
-    it in scripts. text: one line with the problem and its cure; str(error) is the text alone.
+    it in scripts. text: one line with the problem and its remedy; str(error) is the text alone.
     """
 
     def __init__(self, code: str, text: str) -> None:

@@ -96,13 +96,13 @@ def check_pixels(width: int, height: int, what: str = 'an image') -> None:
                          f'{PIXELS // 10**6} million pixels and {SIDE} per side: reduce its size')
 
 
-def path_of(given: object, cure: str = 'pass the path of a file or of a folder') -> Path:
+def path_of(given: object, remedy: str = 'pass the path of a file or of a folder') -> Path:
     """Return the path that a user gave. Raises InputError for what is none, or an empty one."""
     if not isinstance(given, (str, os.PathLike)):
         raise InputError('E-PATH-TYPE',
-                         f'a path must be a str or a Path, not {given!r:.80}: {cure}')
+                         f'a path must be a str or a Path, not {given!r:.80}: {remedy}')
     if given == '':  # Path('') would be the current folder
-        raise InputError('E-PATH-EMPTY', f'the path is empty: {cure}; the current folder is .')
+        raise InputError('E-PATH-EMPTY', f'the path is empty: {remedy}; the current folder is .')
     return Path(given)
 
 

@@ -64,8 +64,8 @@ def test_an_error_without_a_code_is_noticed(tmp_path, line, fault):
 
 def test_texts_are_shown_with_an_ellipsis_for_what_is_not_known(tmp_path):
     (tmp_path / 'module.py').write_text(
-        "CURE = 'copy it ' f'again'\n"
-        "InputError('E-B', f'{path} has {n}{m} of {a | b} ' f'images: {CURE}')\n"
+        "REMEDY = 'copy it ' f'again'\n"
+        "InputError('E-B', f'{path} has {n}{m} of {a | b} ' f'images: {REMEDY}')\n"
         "Finding(level='weak', code='E-A', text='one ' + turn + (' turn' if n else ' bend'))\n"
         "InputError('E-C', text)\n"
         "Notice('E-D', f'{counted(n, \"image\")} skipped')\n")

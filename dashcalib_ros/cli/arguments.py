@@ -21,7 +21,7 @@ ALIASES = {'calibrate': 'run'}
 # exit codes
 ACCEPTED = 0
 WRONG = 1  # of check: the calibration does not fit the drive
-BAD_INPUT = 2  # or bad usage: one line on stderr says what and the cure
+BAD_INPUT = 2  # or bad usage: one line on stderr says what and the remedy
 NOT_ENOUGH = 3  # weak or refused: the input was fine, the evidence was not enough
 INTERRUPTED = 130  # Ctrl-C or SIGTERM, as shells have it
 INPUT_HELP = ('a ROS 2 bag (folder, .mcap, .db3), a ROS 1 .bag, a video, or a folder of images; '
@@ -186,11 +186,11 @@ def _moment(text: str) -> float:
             else _seconds(text.removesuffix('s')))
 
 
-def path_or(cure: str) -> Callable[[str], Path]:
+def path_or(remedy: str) -> Callable[[str], Path]:
     """Return a type of argument: a path that is not - (standard output elsewhere)."""
     def path(text: str) -> Path:
         if text == '-':
-            raise argparse.ArgumentTypeError(f'must not be -: {cure}')
+            raise argparse.ArgumentTypeError(f'must not be -: {remedy}')
         return Path(text)
     return path
 
@@ -303,9 +303,9 @@ COMPLETED = {'--model': MODELS, '--to': KINDS}
 EXCLUSIVE = (('--duration', '--end'), ('--size', '--crop'), ('--workers', '--address', '--shard'))
 
 
-def out_folder(default: str, cure: str = '') -> Argument:
+def out_folder(default: str, remedy: str = '') -> Argument:
     """Return --out for a folder of results."""
-    return '--out', {'type': path_or(f'the results are several files, use a folder{cure}'),
+    return '--out', {'type': path_or(f'the results are several files, use a folder{remedy}'),
                      'default': Path(default), 'metavar': 'DIR',
                      'help': f'folder for the results (default: ./{default})'}
 

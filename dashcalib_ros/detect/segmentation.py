@@ -131,16 +131,16 @@ class SegmentationMask:
     def warning(self) -> Notice | None:
         """Return a warning for the user, one line; None where the result looks right."""
         found = self._found()
-        cure = 'check mask.segmentation_classes'
+        remedy = 'check mask.segmentation_classes'
         if found is None:
             return None
         if not found.any():
             return Notice('E-SEGMENTATION-EMPTY', f'the segmentation model finds no part of the '
-                          f'ego vehicle; if the images show one, {cure}')
+                          f'ego vehicle; if the images show one, {remedy}')
         if found.mean() > LARGEST:
             return Notice('E-SEGMENTATION-TOO-LARGE', f'the mask of the segmentation model is not '
                           f'used: it covers {100 * found.mean():.0f} % of the image, and the '
-                          f'limit is {100 * LARGEST:.0f} %; {cure}')
+                          f'limit is {100 * LARGEST:.0f} %; {remedy}')
         return None
 
     def _found(self) -> Mask | None:

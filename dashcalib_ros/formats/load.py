@@ -82,8 +82,8 @@ def load_camera(path: str | os.PathLike[str], *, name: str | None = None,
 
     Returns a NamedCamera: its `camera` is a Radial, Brown, Rational or Fisheye, in px of the full
     pictures, with the centre of the first pixel at (0, 0). Raises InputError, in one line that
-    names the cure, for a file that cannot be read, a lens that none of these describes, and a file
-    with several cameras where none is named.
+    names the remedy, for a file that cannot be read, a lens that none of these describes, and a
+    file with several cameras where none is named.
     """
     return load_with_faults(path, name, lambda: image_size, nearest).without_faults()
 
@@ -114,7 +114,7 @@ def _checked(label: str, found: Read, size: Callable[[], Size | None], nearest: 
         known = size()
         if known is None:
             raise InputError('E-CALIBRATION-NO-SIZE',
-                             f'{label} has no size of the pictures; {found.cure}')
+                             f'{label} has no size of the pictures; {found.remedy}')
         found = found.of(known)
     notices: tuple[Notice, ...] = ()
     if isinstance(found, OtherLens):

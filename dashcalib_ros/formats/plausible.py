@@ -52,11 +52,11 @@ def check_lens(camera: Camera, path: object) -> None:
     (width, height), centre = camera.image_size, (camera.cx, camera.cy)
     if camera.fx < SHORTEST * width and camera.fy < SHORTEST * height:
         shares = max(abs(value) for value in centre) <= 2
-        cure = (f'they are shares of the picture: multiply fx and cx by {width}, fy and cy by '
+        remedy = (f'they are shares of the picture: multiply fx and cx by {width}, fy and cy by '
                 f'{height}' if shares else 'write them in px, not in mm or shares of the picture')
         raise InputError('E-CALIBRATION-FOCAL',
                          f'{path} has fx = {camera.fx:.4g}, fy = {camera.fy:.4g}, too short for '
-                         f'pictures of {size_text(camera.image_size)}; {cure}')
+                         f'pictures of {size_text(camera.image_size)}; {remedy}')
     if max(camera.fy / camera.fx, camera.fx / camera.fy) > LONGEST_PIXEL:
         raise InputError('E-CALIBRATION-ASPECT', f'{_aspect_text(camera, path)}; correct it')
     if _off(camera, (height, width)) < EXCHANGED and _off(camera, camera.image_size) > AS_GIVEN:
@@ -86,13 +86,13 @@ def check_focal(fx: float, fy: float, path: object) -> None:
 
 
 def doubts(camera: Camera, path: object) -> tuple[Notice, ...]:
-    """Return what is odd in a camera that check_lens() lets pass, each with its cure."""
+    """Return what is odd in a camera that check_lens() lets pass, each with its remedy."""
     found, (width, _) = [], camera.image_size
     if abs(camera.fy / camera.fx - 1) > ASPECT:
-        cure = ('are fy and cx exchanged? the order is fx, fy, cx, cy'
+        remedy = ('are fy and cx exchanged? the order is fx, fy, cx, cy'
                 if abs(camera.cx / camera.fx - 1) < ASPECT else
                 'correct it, unless the pictures are stretched')
-        found.append(Notice('E-CALIBRATION-ASPECT', f'{_aspect_text(camera, path)}; {cure}'))
+        found.append(Notice('E-CALIBRATION-ASPECT', f'{_aspect_text(camera, path)}; {remedy}'))
     if camera.fx > LONGEST * width:
         across_deg = 2 * np.degrees(np.arctan(0.5 * width / camera.fx))
         found.append(Notice(

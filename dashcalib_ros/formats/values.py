@@ -41,11 +41,11 @@ Size = tuple[int, int]
 class Sizeless:
     """A camera of a file that does not say the size of its pictures.
 
-    of: returns it for pictures of (width, height). cure: where nobody knows their size.
+    of: returns it for pictures of (width, height). remedy: where nobody knows their size.
     """
 
     of: Callable[[Size], Camera | NamedCamera | OtherLens]
-    cure: str = 'write their size with --size WxH'
+    remedy: str = 'write their size with --size WxH'
 
 
 Read = Camera | NamedCamera | OtherLens | Sizeless
@@ -358,10 +358,10 @@ def check_lens_kind(lens: str, path: object) -> None:
         raise _not_supported(path, 'the lens model', lens, ROS_MODELS)
 
 
-def no_distortion(data: Data, what: str, cure: str, path: object) -> InputError:
+def no_distortion(data: Data, what: str, remedy: str, path: object) -> InputError:
     """Return the error for a file without known coefficients: they may have other names.
 
-    what: is missing. cure: for a lens without distortion.
+    what: is missing. remedy: for a lens without distortion.
     """
     alike = [str(key) for key, value in _entries(data)
              if COEFFICIENT.match(plain_key(key)) and _has_number(value)]
@@ -371,7 +371,7 @@ def no_distortion(data: Data, what: str, cure: str, path: object) -> InputError:
                           f'{shortened(", ".join(dict.fromkeys(alike)))}; write it as '
                           f'distortion_coefficients: [k1, k2, p1, p2, k3]')
     return InputError('E-NO-DISTORTION', f'{path} has {what}; for pictures without distortion, '
-                                         f'write 0{cure}')
+                                         f'write 0{remedy}')
 
 
 def _entries(data: Any) -> Iterator[tuple[Any, Any]]:

@@ -45,7 +45,7 @@ from dashcalib_ros.input.stamps import StampGate
 from dashcalib_ros.input.video import FramePicture
 from dashcalib_ros.limits import YAML_BYTES, check_file, parse_yaml, read_text
 
-CURE = ("repair it ('mcap recover', 'ros2 bag reindex', 'sqlite3 .recover', 'rosbag reindex'), "
+REMEDY = ("repair it ('mcap recover', 'ros2 bag reindex', 'sqlite3 .recover', 'rosbag reindex'), "
         'copy it again, or record it again')
 NO_CURE = 'check that it is a recording, then copy it again or record it again'
 # of problems that no repair fixes
@@ -192,7 +192,7 @@ def _topics_of(files: tuple[Path, ...], bag: Path) -> tuple[tuple[Topic, ...], b
         why = first_of(problems, TOLD)
         if all(code_of(each) in NO_RECORDING for each in problems):
             raise InputError('E-BAG-NOT-A-RECORDING', f'{bag} cannot be read ({why}): {NO_CURE}')
-        raise InputError('E-BAG-DAMAGED', f'{bag} cannot be read ({why}): {CURE}')
+        raise InputError('E-BAG-DAMAGED', f'{bag} cannot be read ({why}): {REMEDY}')
     return _sorted(counts), indexed
 
 
@@ -217,7 +217,7 @@ class BagSource(FrameSource):
     several image topics and none is chosen.
     """
 
-    _cure = CURE
+    _remedy = REMEDY
     recorded = True
 
     def __init__(self, path: Path, topic: str | None = None, fps: float | None = None) -> None:

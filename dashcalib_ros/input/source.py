@@ -185,7 +185,7 @@ class FrameSource(ABC):
     None if unknown.
     part: (x, y, width, height) that is used of each image, px; None: all of it.
     warnings: what the user should know about the input, one line each; complete after the last
-    frame. contradictions: those that may explain why a drive is not sufficient, with the cure.
+    frame. contradictions: those that may explain why a drive is not sufficient, with the remedy.
 
     Frames are read one by one: memory does not grow with the drive. Their stamps always increase.
     Frame.index counts all images of the input, including skipped ones.
@@ -198,7 +198,7 @@ class FrameSource(ABC):
     recorded = False
     contradictions: tuple[Notice, ...] = ()
     part: tuple[int, int, int, int] | None = None
-    _cure = 'check that another program can play it, or record it again'
+    _remedy = 'check that another program can play it, or record it again'
     _start_ns = 0
     _duration_ns: int | None = None
 
@@ -350,12 +350,12 @@ class FrameSource(ABC):
         if self._start_ns and not reading.undecodable and not reading.warnings:
             return InputError('E-INPUT-START-LATE', f'{self.name} has no image from '
                               f'{self._start_ns / 1e9:g} s on: use a smaller --start')
-        # what is wrong with an image has a cure of its own
+        # what is wrong with an image has a remedy of its own
         if failure := reading.first_failure:
             return InputError(failure.code, f'{self.name} has no readable image ({failure})')
         why = '; '.join(reading.warnings)
         return InputError('E-INPUT-NO-IMAGES', f'{self.name} has no readable image'
-                          f'{f" ({why})" if why else ""}: {self._cure}')
+                          f'{f" ({why})" if why else ""}: {self._remedy}')
 
     @abstractmethod
     def _pictures(self, reading: Reading, start_ns: int = 0) -> Generator[Picture, None, None]:

@@ -46,8 +46,8 @@ class Check:
     given camera, of the cost with their own; None where it was not tried. straight_lines: what
     they say of the given camera; None where there are too few. bound_px: what the given camera's
     error stays below with 95 % confidence. limits_px: by use, what rms_px may be; bound_px may be
-    twice that. good_for: the uses that allow the difference. cure: of what else is wrong than the
-    lens itself.
+    twice that. good_for: the uses that allow the difference. remedy: of what else is wrong than
+    the lens itself.
     """
 
     answer: Answer
@@ -63,13 +63,13 @@ class Check:
     bound_px: float | None = None
     limits_px: Mapping[Use, float] = default(default_factory=dict, hash=False)
     good_for: tuple[Use, ...] = ()
-    cure: str = ''
+    remedy: str = ''
 
     @property
     def next_step(self) -> str:
         """Return what to do with the calibration."""
         if self.answer == 'wrong':
-            return self.cure or REPLACE
+            return self.remedy or REPLACE
         if self.answer == 'cannot tell':
             return 'check it with a drive of more and sharper turns before you replace it'
         others = [use for use in self.limits_px if use not in self.good_for]
@@ -116,7 +116,7 @@ def _by_turns(given: Camera, image_size: tuple[int, int], solution: Solution | N
             return Check('cannot tell', tuple(
                 f'the drive has no accepted calibration of its own: {text}'
                 for text in verdict.main_reasons))
-        return Check('wrong', (size_reason(given, image_size, None, name),), cure=FIT_SIZE)
+        return Check('wrong', (size_reason(given, image_size, None, name),), remedy=FIT_SIZE)
     px = Scale.of(image_size, config).px
 
     def difference(camera: Camera) -> Difference:
@@ -126,11 +126,11 @@ def _by_turns(given: Camera, image_size: tuple[int, int], solution: Solution | N
         alike = (misread_text(given, None, difference) if given.image_size == image_size else '')
         return Check('wrong', ('its distortion folds over inside the picture: points near the '
                                'corners have no place in it', *filter(None, (alike,))),
-                     cure=OTHER_MODEL if alike else '')
+                     remedy=OTHER_MODEL if alike else '')
     here = difference(replace(given, image_size=image_size))
     if given.image_size != image_size:
         # pixels of one size are no error in those of another
-        return Check('wrong', (size_reason(given, image_size, difference, name),), cure=FIT_SIZE)
+        return Check('wrong', (size_reason(given, image_size, difference, name),), remedy=FIT_SIZE)
     loss = loss_of(given.resized(1 / px, solution.camera.image_size), solution, config)
     scaled = scaled_parameters(here, difference) if here.answer == 'wrong' else ''
     alike = ('' if scaled or here.answer == 'right' else
@@ -143,13 +143,13 @@ def _by_turns(given: Camera, image_size: tuple[int, int], solution: Solution | N
     return Check(answer, (*reasons, _loss_text(loss)), here.rms_px, here.worst_px, here.sigma_px,
                  here.told_apart, here.distance, here.limit, loss, bound_px=here.bound_px,
                  limits_px=here.limits_px, good_for=here.good_for,
-                 cure=FIT_SIZE if scaled else OTHER_MODEL if alike else '')
+                 remedy=FIT_SIZE if scaled else OTHER_MODEL if alike else '')
 
 
 def with_faults(found: Check, faults: tuple[str, ...]) -> Check:
     """Return a check with the faults of what stands beside the camera: with any, it is wrong."""
     return replace(found, answer='wrong', reasons=(*faults, *found.reasons), good_for=(),
-                   cure='correct what is wrong beside its lens') if faults else found
+                   remedy='correct what is wrong beside its lens') if faults else found
 
 
 def loss_of(given: Camera, solution: Solution, config: Config) -> float:

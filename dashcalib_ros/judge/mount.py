@@ -149,12 +149,12 @@ def _reasons(level: str, sigma: Floats, own: Floats, metres: float) -> tuple[Not
     if level != 'accepted':
         found.append(Notice('E-MOUNT-LENS', f'the lens is {level}'))
     if max(sigma) > MAX_SIGMA_DEG:
-        cure = ('drive more turns, to know the centre of the picture better'
+        remedy = ('drive more turns, to know the centre of the picture better'
                 if max(own) > MAX_SIGMA_DEG else 'drive straight on for longer')
         found.append(Notice(
             'E-MOUNT-SIGMA',
             f'yaw and pitch are known only to {max(sigma):.2f}° after {metres:.0f} m of straight '
-            f'driving, {MAX_SIGMA_DEG:g}° or better is needed: {cure}'))
+            f'driving, {MAX_SIGMA_DEG:g}° or better is needed: {remedy}'))
     return tuple(found)
 
 

@@ -73,8 +73,8 @@ class Finding:
     """What a rule finds: the verdict it leads to, what is wrong, and what to do.
 
     code: names what is wrong; it stays when the texts are reworded. level: 'accepted' where
-    nothing is wrong. what, cure: in the words of the driver, with the figures;
-    docs/troubleshooting.md explains each. cure: the likeliest first, and only what can help here.
+    nothing is wrong. what, remedy: in the words of the driver, with the figures;
+    docs/troubleshooting.md explains each. remedy: the likeliest first, and only what can help.
     cause: whether the other findings may come from it; then it is the first one. name, value,
     limit: what was measured, of this drive, and what is needed; '' where no two numbers say it.
     """
@@ -82,7 +82,7 @@ class Finding:
     code: str
     level: Level
     what: str
-    cure: str
+    remedy: str
     cause: bool = False
     name: str = ''
     value: str = ''
@@ -121,8 +121,8 @@ def judge(solution: Solution, config: VerdictConfig, lines: Bend | None = None,
     findings.sort(key=lambda found: (not found.objects, found.objects and not found.cause,
                                      found.level != 'refused'))
     if outlook and findings[0].objects and lacks_knowledge_only(grounds):
-        first, more = findings[0].cure, spared('the outlook', [], next_turn, solution) or ''
-        findings = [replace(found, cure=first + (more and f' ({more})')) if found.cure == first
+        first, more = findings[0].remedy, spared('the outlook', [], next_turn, solution) or ''
+        findings = [replace(found, remedy=first + (more and f' ({more})')) if found.remedy == first
                     else found for found in findings]
     return verdict_of(findings)
 
@@ -132,7 +132,7 @@ def verdict_of(findings: Sequence[Finding]) -> Verdict:
     against = [found for found in findings if found.objects]
     levels = {found.level for found in against}
     return Verdict('refused' if 'refused' in levels else 'weak' if levels else 'accepted',
-                   tuple(Notice(found.code, found.what, found.cure) for found in against),
+                   tuple(Notice(found.code, found.what, found.remedy) for found in against),
                    tuple(found.condition for found in findings))
 
 

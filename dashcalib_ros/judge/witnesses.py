@@ -266,11 +266,11 @@ def _gyro(fit: Fit | None, solution: Solution, own: _OwnScale, apart: str
             f'{100 * max(fit.explained, 0.0):.0f} % of their turning): check that it belongs to '
             f'this drive, and that its time stamps are within 0.5 s of those of the pictures')
     if not SCALES[0] < fit.scale < SCALES[1]:
-        cure = ('write rad/s, not degrees per second' if DEGREES[0] < fit.scale < DEGREES[1] else
+        remedy = ('write rad/s, not degrees per second' if DEGREES[0] < fit.scale < DEGREES[1] else
                 'check its unit')
         return None, Notice(
             'E-GYRO-UNIT', f'the gyro is not used: its angles are {fit.scale:.3g} times those of '
-            f'the pictures: {cure}')
+            f'the pictures: {remedy}')
     if fit.out_of_pace:
         return None, Notice(
             'E-GYRO-CLOCK',

@@ -42,7 +42,7 @@ class Calibration(CalibrationData):  # noqa: D101, it is the base's, which has t
 
         These are result.json, calibration.yaml (calibration.weak.yaml where it is weak, none where
         it is refused), and report.html, unless there is no room for it. Raises OutputError, which
-        names the cure.
+        names the remedy.
         """
         return write_results(self, path_of(folder)).files
 

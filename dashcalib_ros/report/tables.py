@@ -85,7 +85,7 @@ def labelled(label: str, word: str) -> Text:
 def next_step(verdict: Verdict) -> RenderableType:
     """Return what to do next: all remedies, the likeliest to help first."""
     first, *others = remedies(verdict)
-    return Group(line(f'next: {first}'), *(line(f'also: {cure}') for cure in others))
+    return Group(line(f'next: {first}'), *(line(f'also: {remedy}') for remedy in others))
 
 
 def _turn_row(turn: TurnSummary, c: CalibrationData) -> tuple[str, ...]:

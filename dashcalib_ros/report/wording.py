@@ -185,7 +185,7 @@ def next_steps(c: CalibrationData, folder: str = FOLDER) -> list[str]:
                     'nothing here.' if c.mount is None else
                     'the mounting only: drive again for it, also straight on.')]
     yaw = c.yaw_deg
-    steps = [f'{cure[0].upper()}{cure[1:]}.' for cure in remedies(c.verdict)]
+    steps = [f'{remedy[0].upper()}{remedy[1:]}.' for remedy in remedies(c.verdict)]
     if c.turns_used < c.config.turns.wanted or yaw < needed.min_yaw_deg:
         steps.append(f'For the next drive: {c.config.turns.wanted} turns of 60° or more, at town '
                      f'speed, in daylight. At least {needed.min_turns} turns and '

@@ -204,7 +204,7 @@ class CameraNode(LifecycleNode):  # type: ignore[misc]
         return SetParametersResult(successful=True)
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
-        """Set parameters as rclpy does; refuse unknown and read-only ones with the cure.
+        """Set parameters as rclpy does; refuse unknown and read-only ones with the remedy.
 
         rclpy refuses these without saying what to do, before it asks the callback that may give a
         reason; the one that it asks earlier may give none (rclcpp pull request 1947 has both).

@@ -345,13 +345,13 @@ def test_what_all_files_say_is_said_once(tmp_path):
     assert warning.code == 'E-RATE-ASSUMED' and 'and 2 more like it' in warning
 
 
-@pytest.mark.parametrize('text, code, cure', [
+@pytest.mark.parametrize('text, code, remedy', [
     ('rtsp://10.0.0.2:554/stream1', 'E-INPUT-STREAM', 'ffmpeg -i rtsp'),
     ('http://10.0.0.2/video', 'E-INPUT-STREAM', 'ffmpeg -i http'),
     ('/dev/video0', 'E-INPUT-LIVE-CAMERA', 'v4l2_camera'),
     (['/dev/video12', 'a.mp4'], 'E-INPUT-LIVE-CAMERA', 'ffmpeg -f v4l2')])
-def test_live_cameras_are_answered_with_what_to_do(text, code, cure):
-    fails(code, text, cure, 'calibrator')
+def test_live_cameras_are_answered_with_what_to_do(text, code, remedy):
+    fails(code, text, remedy, 'calibrator')
 
 
 # -- a part of a drive ---------------------------------------------------------------------------

@@ -62,10 +62,10 @@ def test_a_refused_summary_has_no_numbers_of_a_camera():
 def test_the_conclusion_is_verdict_reasons_and_what_to_do():
     verdict = Verdict('weak', (
         Notice('', '28° of yaw in all turns; at least 60° needed', 'drive sharper turns'),
-        Notice('', 'the zoom changes', 'fix the zoom'), Notice('', 'without cure')))
+        Notice('', 'the zoom changes', 'fix the zoom'), Notice('', 'without remedy')))
     assert terminal(conclusion(verdict)).splitlines() == [
             'verdict: weak', '  28° of yaw in all turns; at least 60° needed',
-            '  the zoom changes', '  without cure']
+            '  the zoom changes', '  without remedy']
     last = terminal(next_step(Verdict('accepted')))
     assert last.startswith('next: ') and 'calibration.yaml' in last
     assert terminal(next_step(verdict)).splitlines() == [

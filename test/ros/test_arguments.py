@@ -142,7 +142,7 @@ def test_a_package_is_looked_up(monkeypatch, tmp_path):
         assert raised.value.code == 'E-ROS-PACKAGE-MISSING'
 
 
-@pytest.mark.parametrize(('url', 'code', 'cure'), [
+@pytest.mark.parametrize(('url', 'code', 'remedy'), [
     ('ftp://host/camera.yaml', 'E-URL-INVALID', 'file:///'),
     ('flash:///camera.yaml', 'E-URL-INVALID', 'file:///'),
     ('file://camera.yaml', 'E-URL-INVALID', 'file:///'),
@@ -151,7 +151,7 @@ def test_a_package_is_looked_up(monkeypatch, tmp_path):
     ('file:///data/${CAMERA}.yaml', 'E-URL-VARIABLE-UNKNOWN', '${NAME}'),
     ('~nobody-of-this-name/camera.yaml', 'E-HOME-UNKNOWN', 'without ~'),
 ])
-def test_other_urls_are_refused_with_the_cure(url, code, cure):
+def test_other_urls_are_refused_with_the_remedy(url, code, remedy):
     with pytest.raises(InputError, match=re.escape(url)) as raised:
         camera_info_path(url, 'front')
-    assert raised.value.code == code and cure in str(raised.value)
+    assert raised.value.code == code and remedy in str(raised.value)

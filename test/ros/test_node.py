@@ -232,7 +232,7 @@ def test_bad_images_are_counted_and_the_node_lives(start_node, make_bench):
     camera.counted('undecodable', len(bad), node)
     stream(camera, 3, 500)
     camera.counted('received', 6 + len(bad), node)
-    # one line for all of them within ten seconds, and it names a cure
+    # one line for all of them within ten seconds, and it names a remedy
     said = [line for line in node.text.splitlines() if 'WARN' in line and 'lost' not in line]
     assert len(said) == 1, node.text
     # which comes first is not said: sizes are checked on arrival, pixels in a thread
