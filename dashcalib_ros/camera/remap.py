@@ -30,7 +30,7 @@ SIDE_POINTS = 512
 HALVINGS = 30
 # in the search for the largest view; about 30 are needed
 SEARCH_STEPS = 300
-# of a shift; a view that is no larger elsewhere stays in the middle
+# of a shift; a view that is not larger elsewhere stays in the middle
 LEAST_SHIFT = 0.001
 # px; outside of the picture, for what the lens does not see: cv2.remap leaves it black
 OUTSIDE = -1.0

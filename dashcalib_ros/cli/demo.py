@@ -138,7 +138,7 @@ def truth_of(drive: Drive) -> dict[str, Any]:
 def mapping_error(calibration: Calibration, drive: Drive, with_field: bool = True) -> Apart | None:
     """Return how far the calibration sees the true viewing rays from their pixels.
 
-    with_field: take the field over the picture into account, where one is used.
+    with_field: take the residual distortion into account, where one is used.
     """
     assert calibration.camera is not None
     pixels, field = grid_of(calibration.camera), calibration.field

@@ -22,7 +22,7 @@ def export(calibration: Given, kind: str) -> str | bytes:
     calibration: a Calibration, what load_camera() returns, a camera, or the path of a file that
     load_camera() reads. kind: colmap, gyroflow, kalibr, opensfm, nerfstudio, mrcal, foxglove, ros,
     opencv, rays or maps; urdf or tf for how the camera sits on the car. What the kind has no place
-    for (the field over the picture, the readout time of a rolling shutter) is omitted.
+    for (the residual distortion, the readout time of a rolling shutter) is omitted.
 
     Returns the file's text; the bytes of an .npz for rays and maps. Raises InputError for a file
     that cannot be read, ConfigError for an unknown kind, a lens that it cannot describe, or a

@@ -117,7 +117,7 @@ def parse_rig(text: str, place: str) -> RigCalibration:
              for pair, found in data['witness']['epipolar_px'].items()},
             _notices(data, 'warnings', 'warning_codes'))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError('E-RIG-FILE', f'{place} is no rig.json of dashcalib, or damaged '
+        raise InputError('E-RIG-FILE', f'{place} is not a rig.json of dashcalib, or damaged '
                          f'({one_line(error)}); use the file that dashcalib rig wrote') from error
 
 

@@ -192,8 +192,8 @@ def _svo(data: Data, path: Path) -> Camera | OtherLens:
     lens = data.get('distortion')
     if data.get('type') != 'pinhole' or not isinstance(lens, dict):
         raise InputError('E-LENS-MODEL',
-                         f'{path} has a camera that is no pinhole with a distortion; calibrate it '
-                         f'as a pinhole')
+                         f'{path} has a camera that is not a pinhole with distortion; calibrate '
+                         f'it as a pinhole')
     name = lens.get('type')
     kind = distortion_model(SVO, name.strip() if isinstance(name, str) else name,
                             'the distortion', path)

@@ -53,7 +53,7 @@ NO_RECORDING = {'E-BAG-NOT-A-RECORDING', 'E-BAG-TOO-LARGE'}
 # types of image_transport's messages that are not read
 VIDEO_TYPES = re.compile('image_transport|theora|h26[45]')
 # problems of files in a message
-TOLD = 12
+LISTED = 12
 
 
 @dataclass(frozen=True)
@@ -189,7 +189,7 @@ def _topics_of(files: tuple[Path, ...], bag: Path) -> tuple[tuple[Topic, ...], b
         counts.update(found)
         indexed &= by_index
     if problems and not counts:
-        why = first_of(problems, TOLD)
+        why = first_of(problems, LISTED)
         if all(code_of(each) in NO_RECORDING for each in problems):
             raise InputError('E-BAG-NOT-A-RECORDING', f'{bag} cannot be read ({why}): {NO_CURE}')
         raise InputError('E-BAG-DAMAGED', f'{bag} cannot be read ({why}): {REMEDY}')

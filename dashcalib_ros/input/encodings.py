@@ -29,7 +29,7 @@ PICTURES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage',
     for name in ('CompressedImage', 'RawImage', 'CompressedVideo'))
 CAMERA_INFOS = ('sensor_msgs/msg/CameraInfo', 'foxglove.CameraCalibration',
                 'foxglove_msgs/msg/CameraCalibration')
-# messages that are no part of ROS itself
+# messages that are not part of ROS itself
 FURTHER = {
     'foxglove_msgs/msg/CompressedImage':
         'time timestamp\nstring frame_id\nuint8[] data\nstring format\n',

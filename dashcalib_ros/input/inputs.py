@@ -63,7 +63,7 @@ MAKERS = {maker: re.compile(name, re.IGNORECASE) for maker, name in (
     ('Insta360 names', r'(?:PRO_)?VID_(?P<t>\d{8}_\d{6})_(?P<c>\d\d)_(?P<n>\d+)(?:_\d+)?'),
     ('Vantrue names', r'(?P<t>\d{8}_\d{6})_(?P<n>\d+)_(?:[A-Z]_)?(?P<c>[ABC])'))}
 # names of files in a message; of more only the first and the last are named
-TOLD = 12
+LISTED = 12
 # missing files for each that is there, where they are numbered one by one
 MOST_MISSING = 3
 
@@ -318,7 +318,7 @@ def _listed(sources: Sequence[FrameSource]) -> str:
 
 def _names(paths: Sequence[Path]) -> str:
     names = _told_apart(paths)
-    return ', '.join(names if len(names) <= TOLD else [*names[:TOLD - 2], '...', names[-1]])
+    return ', '.join(names if len(names) <= LISTED else [*names[:LISTED - 2], '...', names[-1]])
 
 
 def _told_apart(paths: Sequence[Path]) -> list[str]:
@@ -349,7 +349,7 @@ def _missing(sources: Sequence[FrameSource]) -> str:
     width = len(digits) if digits.startswith('0') else 0
     names = [''.join([*parts[0][:place], f'{n:0{width}d}', *parts[0][place + 1:]])
              for n in range(numbers[0], numbers[-1]) if n not in numbers]
-    return f'; missing: {first_of(names, TOLD)}'
+    return f'; missing: {first_of(names, LISTED)}'
 
 
 def _open_one(place: Path, topic: str | None, fps: float | None) -> FrameSource:

@@ -26,7 +26,7 @@ EPOCH_S = 1e8
 LATEST_S = 1e10
 # what other units of stamps since 1970 are, in s
 UNITS = {'milliseconds': 1e-3, 'microseconds': 1e-6, 'nanoseconds': 1e-9}
-# s between two stamps of a sensor; by this, ns since a computer was started are no ms since 1970
+# s between two stamps of a sensor; by this, ns since a computer was started are not ms since 1970
 LONGEST_STEP_S = 60.0
 # metres of a degree of latitude
 DEGREE_M = 111_320.0

@@ -149,7 +149,7 @@ class Picture:
 class Reading:
     """What happened in one pass over the images.
 
-    images: how many there were, also those that are no frames; complete after the last one.
+    images: how many there were, also those that are not frames; complete after the last one.
     """
 
     warnings: list[Notice] = field(default_factory=list)

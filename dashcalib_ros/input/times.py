@@ -29,7 +29,7 @@ EPOCH_NS = 10**18
 # ns between two images of a drive: where the time since 1970 tells the unit, and else, by which
 # no two units fit
 STEPS_NS, LIKELY_STEPS_NS = (10**6, 60 * SECOND_NS), (5 * 10**6, 2 * SECOND_NS)
-# of the median step; others are no regular ones, of which there must be this share
+# of the median step; others are not regular, of which there must be this share
 REGULAR, MOSTLY = (0.5, 1.5), 0.5
 # share of names or lines that may lack a time
 LACKING = 0.1

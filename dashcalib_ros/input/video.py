@@ -45,7 +45,7 @@ MOST_STRETCH = 4.0
 # what the shape of a picture leaves of square pixels, as sizes are whole numbers
 ALMOST_SQUARE = 0.02
 SQUARE = (1.0, 1.0)
-# FFmpeg's flags of a stream of pictures that are no video
+# FFmpeg's flags of a stream of pictures that is not a video
 THUMBNAILS = int(Disposition.attached_pic | Disposition.timed_thumbnails)
 
 # luma of television's range, 16 to 235 -> 0 to 255

@@ -129,7 +129,7 @@ def _by_turns(given: Camera, image_size: tuple[int, int], solution: Solution | N
                      remedy=OTHER_MODEL if alike else '')
     here = difference(replace(given, image_size=image_size))
     if given.image_size != image_size:
-        # pixels of one size are no error in those of another
+        # px of one size are not px of another: this is not an error
         return Check('wrong', (size_reason(given, image_size, difference, name),), remedy=FIT_SIZE)
     loss = loss_of(given.resized(1 / px, solution.camera.image_size), solution, config)
     scaled = scaled_parameters(here, difference) if here.answer == 'wrong' else ''
@@ -232,7 +232,7 @@ def export_command(name: str, change: str) -> str:
 
 
 def _part(given: Camera, image_size: tuple[int, int], compare: Compare) -> tuple[int, int] | None:
-    """Return where the drive's pictures lie in the given camera's; None if they are no part."""
+    """Return where the drive's pictures lie in the given camera's; None if they are not a part."""
     found = compare(replace(given, image_size=image_size))
     spare = np.subtract(given.image_size, image_size)
     x, y = (int(value) for value in np.clip(np.round(found.offsets[2:4]), np.minimum(spare, 0),

@@ -298,7 +298,7 @@ REPORTED_FIELD_PX = 0.5
 
 def _warnings(found: CalibrationData, solution: Solution, evidence: Evidence
               ) -> tuple[Notice, ...]:
-    """Return what the user must know of the numbers, which are no reason for the verdict."""
+    """Return what the user must know of the numbers, which does not change the verdict."""
     level, model, field = found.verdict.level, found.config.model, found.field
     warnings = []
     if evidence.temperature is not None and _warmth(solution, evidence) is None:

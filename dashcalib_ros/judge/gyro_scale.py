@@ -63,7 +63,7 @@ class _Stretch:
 
 # a scale farther off is one of units, or of another drive
 SCALES = (0.7, 1.4)
-# one that is known worse tells less than that a gyro is no worse than 3 %
+# a scale with a larger sigma says less than that gyros are good to 3 %
 LARGEST_SIGMA = 0.05
 
 

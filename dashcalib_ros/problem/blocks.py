@@ -345,7 +345,7 @@ class Shake(ImageBlock):
         return replace(self, readout_s=imaging.readout_s, bumps=float(size))
 
 
-# the field over the picture
+# the residual distortion over the picture
 
 # singular values below this share of the largest: the camera cannot make such a field
 LEAST_PART = 1e-3
@@ -353,7 +353,7 @@ LEAST_PART = 1e-3
 
 @dataclass(frozen=True)
 class Smooth(SharedBlock):
-    """The smooth field over the picture. value: (f,) px, how far it goes in each direction.
+    """The smooth residual distortion. value: (f,) px, how far it goes in each direction.
 
     basis: (2 len(TERMS), f) the directions, see field_basis(). sigma: of the prior of each, px.
     """
@@ -659,7 +659,7 @@ class Imaging:
 
     @property
     def field(self) -> Field:
-        """Return the field over the picture."""
+        """Return the residual distortion over the picture."""
         smooth = self.smooth
         return Field(self.camera.image_size, (smooth.basis @ smooth.value).reshape(2, -1))
 

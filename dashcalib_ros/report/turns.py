@@ -113,7 +113,7 @@ def spans_of(c: CalibrationData) -> list[tuple[float, float, float]]:
 def names(c: CalibrationData) -> dict[TurnId, str]:
     """Return the turns' short names: numbers in the order of time, s1, s2 for stored ones."""
     own = {turn.id: str(n) for n, turn in enumerate(c.turns, 1)}
-    # a fleet's clips are no earlier drives
+    # a fleet's clips are not earlier drives
     return own | {turn.id: f'{"" if turn.clip else "s"}{n}'
                   for n, turn in enumerate(c.stored_turns, 1)}
 

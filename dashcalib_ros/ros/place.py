@@ -86,7 +86,7 @@ class StoredTurns:
             file = decoded(read_file(path, LARGEST))
         except (InputError, ValueError, OSError) as error:
             if path.exists():  # or its calibrator has removed it
-                self._complaints.say('store', f'{path} is no stored turn ({one_line(error)}): '
+                self._complaints.say('store', f'{path} is not a stored turn ({one_line(error)}): '
                                               f'delete it')
             return
         new = [turn for turn in file.turns if is_turn(turn.prominence)]

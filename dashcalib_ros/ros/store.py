@@ -375,7 +375,7 @@ def _checksum(content: Mapping[str, Any]) -> str:
     sealed = {key: value for key, value in content.items() if key != 'projection_matrix'}
     try:
         text = json.dumps({**sealed, 'dashcalib': own}, sort_keys=True, default=str)
-    except TypeError:  # keys that are no texts: no node writes these
+    except TypeError:  # keys that are not text: no node writes these
         return ''
     return hashlib.sha256(text.encode()).hexdigest()
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scenes -> one shared camera with its covariance (paper, 3.2), as one problem.
 
-The lens, a rolling shutter's readout, a smooth field over the picture, where a stabiliser moves
+The lens, a rolling shutter's readout, a smooth residual distortion, where a stabiliser moves
 the picture its shift in each image, and the structures of all turns are found together.
 """
 from __future__ import annotations

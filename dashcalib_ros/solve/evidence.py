@@ -169,7 +169,7 @@ def chosen_kind(found: Sequence[Estimate]) -> tuple[Estimate, tuple[Candidate, .
 
 
 def field_size(found: Estimate) -> float:
-    """Return the size of the field over the picture, RMS px of 1000 px of width."""
+    """Return the size of the residual distortion, RMS px of 1000 px of width."""
     size = np.sqrt(np.mean(found.imaging.field.over(found.camera)**2))
     return float(size * 1000 / found.camera.image_size[0])
 

@@ -2,7 +2,7 @@
 """A folder of reconstructed turns, so that short trips add up (config: turns.store).
 
 There is one file for each turn. It is written completely under a unique name, and never changed:
-any number of processes may share the folder. Files that are no turns of this camera are not used
+any number of processes may share the folder. Files that are not turns of this camera are not used
 and not changed.
 """
 from __future__ import annotations
