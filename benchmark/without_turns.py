@@ -3,18 +3,24 @@
 """What drives without a sharp turn know of the focal length: pieces of real ones, rendered ones.
 
     python benchmark/without_turns.py [--data DIR] [--seconds S] [--drives NAME ...]
-                                      [--seeds 8000-8009] [--spoilt NAME ...] [--results]
+                                      [--seeds 8000-8009] [--spoilt NAME ...] [--fleet]
+                                      [--results]
 
 Real drives are cut into pieces of so many seconds; a piece with a turn of 20 degrees or more is
 left out. A seed draws a camera and a street as population.py does, and a drive of 10 to 40 s
 with bumps: straight with lane keeping, or bends of 100 to 800 m radius. Each is calibrated
 twice: without knowing anything, and with known.stabiliser=no. --spoilt: rendered drives whose
-pictures a stabiliser moved, or that were zoomed or cropped; nothing is known of them.
+pictures a stabiliser moved, or that were zoomed or cropped; nothing is known of them. --fleet:
+pieces without a sharp turn, as the clips of one camera of a fleet; there is no stabiliser.
 Rows go to DIR/without_turns.json; what is there is not run again. --results writes the table into
 benchmark/results/without_turns.md.
 """
 from __future__ import annotations
 
+import csv
+import subprocess
+import sys
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -29,13 +35,15 @@ from measure import commit, isolated, keep_table, load, parser_with, save, table
 from population import closest_cameras, rays_of
 from population import drive_of as camera_and_street
 
-from dashcalib_ros import Config, calibrate
+from dashcalib_ros import Config, calibrate, load_calibration, open_frames
 from dashcalib_ros.demo import Drive, Turn
 from dashcalib_ros.judge import CalibrationData
 
 # input, images per second of folders, and the truth of fx with its sigma, px
 DRIVES = {'kitti03': ('bag', None, 718.2, 1.8), 'kitti07': ('images', 9.65, 701.9, 1.4),
           'kitti_raw': ('images', 9.7, 981.5, 3.0), 'carnd': ('drive.mp4', None, 1161.0, 10.0)}
+# s where the pieces begin that are a fleet's clips, and how many there are
+FLEETS = {'kitti03': (10.5, 7), 'carnd': (0.0, 5)}
 # degrees
 SHARP = 20.0
 DURATION_S = (10.0, 40.0)
@@ -118,6 +126,29 @@ def piece(data: Path, name: str, start_s: float, seconds: float, stabiliser: str
     return row_of(found, fx, fx_sigma)
 
 
+def fleet(data: Path, name: str, seconds: float) -> dict[str, Any]:
+    """Calibrate a camera by its clips, folders of images (in a process of its own)."""
+    place, fps, fx, fx_sigma = DRIVES[name]
+    begin, count = FLEETS[name]
+    with tempfile.TemporaryDirectory() as at:
+        with open(f'{at}/clips.csv', 'w', encoding='utf-8') as stream:
+            rows = csv.writer(stream)
+            rows.writerow(['clip', 'camera', 'fps', 'known'])
+            for k in range(count):
+                folder = Path(at, f'{name}-{k}')
+                folder.mkdir()
+                stamps = []
+                for frame in open_frames(data / name / place, fps=fps,
+                                         start_s=begin + k * seconds, duration_s=seconds):
+                    stamps.append(frame.stamp_ns)
+                    cv2.imwrite(str(folder / f'{len(stamps):05d}.png'), frame.image)
+                rate = 1e9 / float(np.median(np.diff(stamps)))
+                rows.writerow([folder.name, name, f'{rate:.2f}', 'stabiliser=no'])
+        subprocess.run([sys.executable, '-m', 'dashcalib_ros', 'batch', f'{at}/clips.csv', '--out',
+                        f'{at}/out', '--workers', '1'], check=False, stdout=subprocess.DEVNULL)
+        return row_of(load_calibration(f'{at}/out/cameras/{name}/result.json'), fx, fx_sigma)
+
+
 def rendered(seed: int, spoilt: str, stabilisers: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Calibrate a rendered drive (in a process of its own); return a row for each stabiliser."""
     cv2.setNumThreads(1)
@@ -159,6 +190,7 @@ def main() -> None:
     parser.add_argument('--pieces', type=int, default=8, help='of each drive, at most')
     parser.add_argument('--spoilt', nargs='*', choices=SPOILT, default=[], metavar='NAME',
                         help='of ' + ', '.join(SPOILT).replace('%', '%%'))
+    parser.add_argument('--fleet', action='store_true', help='also the clips of two cameras')
     args = parser.parse_args()
     path, at = args.out / 'without_turns.json', commit()
     rows = load(path)
@@ -176,6 +208,11 @@ def main() -> None:
                 if key not in rows:
                     done = isolated(piece, args.data, name, float(start), args.seconds, stabiliser)
                     keep(key, done.value, done.failure)
+    for name in FLEETS if args.fleet else ():
+        key = f'{name} | fleet of {FLEETS[name][1]} clips | {args.seconds:.0f} s | no'
+        if key not in rows:
+            done = isolated(fleet, args.data, name, args.seconds)
+            keep(key, done.value, done.failure)
     for seed in args.seeds:
         for spoilt in ('', *args.spoilt):
             stabilisers = ('',) if spoilt else ('', 'no')
@@ -197,7 +234,8 @@ def main() -> None:
             [f'{row["fx"]:.1f} ± {row["sigma"]:.1f}', f'{row["percent"]:+.1f}',
              f'{row["sigmas"]:+.1f}'])] for key, row in kept.items()])
     for words, belongs in (
-            ('Real pieces', lambda key: key.startswith(tuple(DRIVES))),
+            ('Real pieces', lambda key: key.startswith(tuple(DRIVES)) and 'fleet' not in key),
+            ('Fleets', lambda key: 'fleet' in key),
             ('Rendered', lambda key: 'as it is' in key),
             ('Spoilt', lambda key: 'rendered' in key and 'as it is' not in key)):
         for known in ('not known', 'no'):
