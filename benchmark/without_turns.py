@@ -35,8 +35,9 @@ from measure import commit, isolated, keep_table, load, parser_with, save, table
 from population import closest_cameras, rays_of
 from population import drive_of as camera_and_street
 
-from dashcalib_ros import Config, calibrate, load_calibration, open_frames
+from dashcalib_ros import Config, calibrate, open_frames
 from dashcalib_ros.demo import Drive, Turn
+from dashcalib_ros.formats.ours import load_calibration
 from dashcalib_ros.judge import CalibrationData
 
 # input, images per second of folders, and the truth of fx with its sigma, px
