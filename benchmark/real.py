@@ -8,7 +8,8 @@ Each drive is tracked anew with each seed. Its turns are then solved in every co
 and more (where one is sharp), and alone: as they are, and with the field of all turns taken out.
 Where true poses are there, fx is also asked of them: the focal length with which the sharp turns'
 angles are the true ones, in the sum of their signed errors (the lens otherwise as found). The
-scale drift is that between a turn's first half and its second, against the poses.
+scale drift is that between a turn's first half and its second, against the poses. Each drive is
+also calibrated by all of its stretches, as with `--thorough`.
 """
 from __future__ import annotations
 
@@ -33,7 +34,7 @@ from measure import (
     table,
 )
 
-from dashcalib_ros import Config, open_frames
+from dashcalib_ros import Config, calibrate, open_frames
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.field import Field
 from dashcalib_ros.detect.detection import detect
@@ -137,8 +138,21 @@ def subsets(scenes: Sequence[Scene], sharp: set[Any], config: Config, px: float
                 rows.append({'turns': [scene.turn.number for scene in some], 'count': count,
                              'sharp': sum(scene.turn in sharp for scene in found.scenes),
                              'fx': px * found.camera.fx, 'sigma': px * found.sigma[0],
-                             'field': found.field is not None})
+                             'field': found.field is not None,
+                             'drift': found.drift is not None})
     return rows
+
+
+def by_all_stretches(drive: Recorded, data: Path) -> dict[str, Any]:
+    """Return what `dashcalib run --thorough` finds."""
+    found = calibrate(data / drive.name / drive.pictures, fps=drive.fps,
+                      config={'turns.thorough': True})
+    row: dict[str, Any] = {'verdict': found.verdict.level, 'reasons': list(found.verdict.reasons),
+                           'stretches': sum(turn.used for turn in found.turns)}
+    if found.camera is None or found.sigma is None:
+        return row
+    return {**row, 'fx': found.camera.fx, 'sigma': found.sigma['fx'],
+            'drift': found.drift is not None}
 
 
 def beside_poses(scenes: Sequence[Scene], whole: Solution, shipped: Camera, poses: Poses,
@@ -183,7 +197,8 @@ def summary(rows: Mapping[str, Mapping[str, Any]]) -> str:
     """Return the table."""
     lines = []
     for drive in DRIVES:
-        own = [row for name, row in rows.items() if row['drive'] == drive.name and 'fx' in row]
+        own = [row for row in rows.values()
+               if row['drive'] == drive.name and 'subsets' in row]
         if not own:
             continue
         both = np.hypot([each['sigma'] for row in own for each in row['subsets']], drive.fx_sigma)
@@ -201,13 +216,34 @@ def summary(rows: Mapping[str, Mapping[str, Any]]) -> str:
             f'{np.mean(rotation):.1f}' if rotation else '',
             f'{np.sum(np.abs(off) <= 2 * both)} of {len(off)}',
             f'{np.median(sigmas):.2f}; {sigmas.max():.2f}' if len(sigmas) else '',
+            f'{sum(each["drift"] for row in own for each in row["subsets"])}',
             f'{before:.2f} → {after:.2f}',
             *('; '.join(f'{value:+.1f}' for value in np.mean(
                 [row['scale_drift'][name] for row in own if 'scale_drift' in row], axis=0))
               if rotation else '' for name in ('shipped', 'ours, no field', 'ours'))])
     return table(['drive', 'verdict', 'fx, px', 'judged by', 'by true angles',
-                  'combinations within 2σ', 'their σ %: median; largest', 'turns alone, sd %',
-                  'scale drift %: shipped K', 'ours, no field', 'ours'], lines)
+                  'combinations within 2σ', 'their σ %: median; largest', 'drift named in',
+                  'turns alone, sd %', 'scale drift %: shipped K', 'ours, no field', 'ours'],
+                 lines)
+
+
+def compared(rows: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return the table of all stretches beside the best five turns of the first seed."""
+    lines = []
+    for drive in DRIVES:
+        few, all_ = (next((row for row in rows.values() if row['drive'] == drive.name
+                           and key in row and 'fx' in row), None)
+                     for key in ('subsets', 'stretches'))
+        if few is None or all_ is None:
+            continue
+        off = (all_['fx'] - drive.fx) / float(np.hypot(all_['sigma'], drive.fx_sigma))
+        lines.append([
+            drive.name, f'{few["fx"]:.1f} ± {few["sigma"]:.2f}', all_['verdict'],
+            str(all_['stretches']), f'{all_["fx"]:.1f} ± {all_["sigma"]:.2f}',
+            f'{all_["sigma"] / few["sigma"]:.2f}', f'{off:+.1f}',
+            'yes' if all_['drift'] else 'no'])
+    return table(['drive', 'five turns: fx, px', 'all stretches', 'how many', 'fx, px',
+                  'sigma, of that of five turns', 'off in sigmas', 'drift named'], lines)
 
 
 def main() -> None:
@@ -227,7 +263,16 @@ def main() -> None:
                       **(outcome.value or {'verdict': 'failed', 'reasons': [outcome.failure]})}
         save(path, rows)
         complain(f'{name}: {json.dumps(rows[name])[:300]}')
-    keep_table('real', summary(rows), arguments, [row['commit'] for row in rows.values()])
+    for drive in DRIVES:
+        name = f'{drive.name}, all stretches'
+        if drive.name in arguments.drives and (arguments.again or not done(rows.get(name))):
+            outcome = isolated(by_all_stretches, drive, arguments.data)
+            rows[name] = {'drive': drive.name, 'commit': commit(),
+                          **(outcome.value or {'verdict': 'failed', 'reasons': [outcome.failure]})}
+            save(path, rows)
+            complain(f'{name}: {json.dumps(rows[name])[:300]}')
+    keep_table('real', f'{summary(rows)}\n\n{compared(rows)}', arguments,
+               [row['commit'] for row in rows.values()])
 
 
 if __name__ == '__main__':
