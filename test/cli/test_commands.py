@@ -224,7 +224,7 @@ def test_in_a_pipe_progress_is_a_line_from_time_to_time(fake, drive, monkeypatch
 
 def test_flags_win_over_set_which_wins_over_the_file(fake, drive, tmp_path):
     path = tmp_path / 'config.yaml'
-    path.write_text('turns:\n  wanted: 2\n  half_width: 2\nseed: 3\nmotion.standing_px: 2e-1\n')
+    path.write_text('turns:\n  wanted: 2\n  half_width: 2\nseed: 3\ntracking.standing_px: 2e-1\n')
     assert main(['run', drive, '--config', str(path), '--set', 'turns.wanted=3', '--set',
                  'turns.half_width=1e0', '--turns', '4', '--workers', '2', '--verbose']) == 0
     wanted = Config().replace({'turns.wanted': 4, 'turns.at_most': 4, 'turns.half_width': 1.0,
