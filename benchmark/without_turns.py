@@ -147,7 +147,11 @@ def fleet(data: Path, name: str, seconds: float) -> dict[str, Any]:
                 rows.writerow([folder.name, name, f'{rate:.2f}', 'stabiliser=no'])
         subprocess.run([sys.executable, '-m', 'dashcalib_ros', 'batch', f'{at}/clips.csv', '--out',
                         f'{at}/out', '--workers', '1'], check=False, stdout=subprocess.DEVNULL)
-        return row_of(load_calibration(f'{at}/out/cameras/{name}/result.json'), fx, fx_sigma)
+        with open(f'{at}/out/cameras.csv', encoding='utf-8', newline='') as stream:
+            turns = int(next(csv.DictReader(stream))['turns'])
+        found = load_calibration(f'{at}/out/cameras/{name}/result.json')
+        # whose turns are in the clips' files
+        return {**row_of(found, fx, fx_sigma), 'yaw': float('nan'), 'scenes': turns}
 
 
 def rendered(seed: int, spoilt: str, stabilisers: Sequence[str]) -> dict[str, dict[str, Any]]:
@@ -225,12 +229,13 @@ def main() -> None:
                     keep(key, (done.value or {}).get(stabiliser), done.failure)
     # a piece may be beyond the end of its drive, or have a turn
     kept = {key: row for key, row in rows.items() if row['verdict'] != 'failed' and row['scenes']
-            and (row['yaw'] < SHARP or not key.startswith(tuple(DRIVES)))}
+            and not (row['yaw'] >= SHARP and key.startswith(tuple(DRIVES)))}
     text = table(
         ['drive', 'from s; or what was done', 'length', 'stabiliser', 'verdict', 'stretches',
          'largest yaw °', 'fx', 'off %', 'off in sigmas'],
         [[*key.replace('rendered', f'{row.get("seconds", 0):.0f} s').split(' | '), row['verdict'],
-          f'{row["scenes"]}', f'{row["yaw"]:.0f}',
+          f'{row["scenes"]}',
+          '' if np.isnan(row['yaw']) else f'{row["yaw"]:.0f}',
           *(['none', '', ''] if row['fx'] is None else
             [f'{row["fx"]:.1f} ± {row["sigma"]:.1f}', f'{row["percent"]:+.1f}',
              f'{row["sigmas"]:+.1f}'])] for key, row in kept.items()])
