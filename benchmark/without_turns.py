@@ -151,7 +151,7 @@ def fleet(data: Path, name: str, seconds: float) -> dict[str, Any]:
             turns = int(next(csv.DictReader(stream))['turns'])
         found = load_calibration(f'{at}/out/cameras/{name}/result.json')
         # whose turns are in the clips' files
-        return {**row_of(found, fx, fx_sigma), 'yaw': float('nan'), 'scenes': turns}
+        return {**row_of(found, fx, fx_sigma), 'yaw': None, 'scenes': turns}
 
 
 def rendered(seed: int, spoilt: str, stabilisers: Sequence[str]) -> dict[str, dict[str, Any]]:
@@ -229,13 +229,13 @@ def main() -> None:
                     keep(key, (done.value or {}).get(stabiliser), done.failure)
     # a piece may be beyond the end of its drive, or have a turn
     kept = {key: row for key, row in rows.items() if row['verdict'] != 'failed' and row['scenes']
-            and not (row['yaw'] >= SHARP and key.startswith(tuple(DRIVES)))}
+            and not ((row['yaw'] or 0.0) >= SHARP and key.startswith(tuple(DRIVES)))}
     text = table(
         ['drive', 'from s; or what was done', 'length', 'stabiliser', 'verdict', 'stretches',
          'largest yaw °', 'fx', 'off %', 'off in sigmas'],
         [[*key.replace('rendered', f'{row.get("seconds", 0):.0f} s').split(' | '), row['verdict'],
           f'{row["scenes"]}',
-          '' if np.isnan(row['yaw']) else f'{row["yaw"]:.0f}',
+          '' if row['yaw'] is None else f'{row["yaw"]:.0f}',
           *(['none', '', ''] if row['fx'] is None else
             [f'{row["fx"]:.1f} ± {row["sigma"]:.1f}', f'{row["percent"]:+.1f}',
              f'{row["sigmas"]:+.1f}'])] for key, row in kept.items()])
