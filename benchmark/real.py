@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -252,25 +252,22 @@ def main() -> None:
                             drives=[drive.name for drive in DRIVES]).parse_args()
     path = arguments.out / 'real.json'
     rows = load(path)
-    for seed, drive in itertools.product(arguments.seeds, DRIVES):
-        if drive.name not in arguments.drives:
-            continue
-        name = f'{drive.name}, seed {seed}'
+    chosen = [drive for drive in DRIVES if drive.name in arguments.drives]
+
+    def measure(name: str, function: Callable[..., dict[str, Any]], drive: Recorded, *more: int
+                ) -> None:
         if done(rows.get(name)) and not arguments.again:
-            continue
-        outcome = isolated(measured, drive, arguments.data, seed)
+            return
+        outcome = isolated(function, drive, arguments.data, *more)
         rows[name] = {'drive': drive.name, 'commit': commit(),
                       **(outcome.value or {'verdict': 'failed', 'reasons': [outcome.failure]})}
         save(path, rows)
         complain(f'{name}: {json.dumps(rows[name])[:300]}')
-    for drive in DRIVES:
-        name = f'{drive.name}, all stretches'
-        if drive.name in arguments.drives and (arguments.again or not done(rows.get(name))):
-            outcome = isolated(by_all_stretches, drive, arguments.data)
-            rows[name] = {'drive': drive.name, 'commit': commit(),
-                          **(outcome.value or {'verdict': 'failed', 'reasons': [outcome.failure]})}
-            save(path, rows)
-            complain(f'{name}: {json.dumps(rows[name])[:300]}')
+
+    for seed, drive in itertools.product(arguments.seeds, chosen):
+        measure(f'{drive.name}, seed {seed}', measured, drive, seed)
+    for drive in chosen:
+        measure(f'{drive.name}, all stretches', by_all_stretches, drive)
     keep_table('real', f'{summary(rows)}\n\n{compared(rows)}', arguments,
                [row['commit'] for row in rows.values()])
 

@@ -181,7 +181,7 @@ READERS: dict[str, Callable[[str, bytes], Iterator[Values]]] = {
 def _row(number: int, values: Values, folder: str) -> Row:
     if isinstance(values, str):
         return Row(number, '', '', problem=values)
-    values = {RENAMED.get(name, name): value for name, value in values.items()}
+    values = _by_present_names(values)
     clip, camera, camera_model, fps, topic, time, known, temperature, rig = (
         '' if values.get(name) is None else str(values[name]).strip() for name in COLUMNS)
     if not clip:
@@ -194,6 +194,12 @@ def _row(number: int, values: Values, folder: str) -> Row:
                        temperature_c=_temperature(temperature) if temperature else None)
     except (ValueError, ConfigError) as error:
         return replace(row, problem=str(error))
+
+
+def _by_present_names(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values by name, with those of earlier names where the present one is not there."""
+    return {**{RENAMED[name]: value for name, value in values.items() if name in RENAMED},
+            **values}
 
 
 def _known(text: str) -> tuple[tuple[str, str], ...]:
@@ -241,7 +247,7 @@ def _grouped(row: Row, pattern: re.Pattern[str]) -> Row:
     if found is None:
         return row if row.camera else replace(
             row, problem=row.problem or '--group-by matches no camera in the name of the clip')
-    named = {RENAMED.get(name, name): value for name, value in found.groupdict().items()}
+    named = _by_present_names(found.groupdict())
     camera = named.get('camera') or (found.group(1) if pattern.groups else found.group(0))
     return replace(row, camera=row.camera or camera or '',
                    camera_model=row.camera_model or named.get('camera_model') or '')

@@ -150,7 +150,7 @@ def _reasons(level: str, sigma: Floats, own: Floats, metres: float) -> tuple[Not
         found.append(Notice('E-MOUNT-LENS', f'the lens is {level}'))
     if max(sigma) > MAX_SIGMA_DEG:
         remedy = ('drive more turns, to know the centre of the picture better'
-                if max(own) > MAX_SIGMA_DEG else 'drive straight on for longer')
+                  if max(own) > MAX_SIGMA_DEG else 'drive straight on for longer')
         found.append(Notice(
             'E-MOUNT-SIGMA',
             f'yaw and pitch are known only to {max(sigma):.2f}° after {metres:.0f} m of straight '

@@ -267,7 +267,7 @@ def _gyro(fit: Fit | None, solution: Solution, own: _OwnScale, apart: str
             f'this drive, and that its time stamps are within 0.5 s of those of the pictures')
     if not SCALES[0] < fit.scale < SCALES[1]:
         remedy = ('write rad/s, not degrees per second' if DEGREES[0] < fit.scale < DEGREES[1] else
-                'check its unit')
+                  'check its unit')
         return None, Notice(
             'E-GYRO-UNIT', f'the gyro is not used: its angles are {fit.scale:.3g} times those of '
             f'the pictures: {remedy}')

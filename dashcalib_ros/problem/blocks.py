@@ -314,8 +314,8 @@ class Shake(ImageBlock):
 
     As bumps make it; Imaging.steering has the rest. axes: by stretch (3,) about which the car
     turns, in the camera's axes. readout_s, bumps: s and rad, at which the prior is taken; a step
-    does not change them, or a longer readout would make the same shaking likelier. On a rough road
-    bumps is how far the images shake (RMS): of a prior for a smooth one the readout would make up.
+    does not change them, or a longer readout would make the same shaking likelier. bumps is how
+    far the images shake (RMS): with the prior of a smooth road a rough one shifts fx and readout.
     """
 
     axes: Mapping[TurnId, Floats] = field(default_factory=dict)
@@ -337,12 +337,13 @@ class Shake(ImageBlock):
     def anchored(self, imaging: Imaging) -> Shake:
         if not imaging.coupled:
             return replace(self, readout_s=imaging.readout_s, bumps=0.0, value={})
-        shaken = [turned[turned.any(axis=1)] @ (np.eye(3) - np.outer(axis, axis))
-                  for turn, turned in self.value.items() for axis in (self.axes[turn],)]
-        count = sum(map(len, shaken))
-        # about two axes
-        size = np.sqrt(sum(np.sum(turned**2) for turned in shaken) / max(2 * count, 1))
-        return replace(self, readout_s=imaging.readout_s, bumps=float(size))
+        shaken = np.concatenate([np.zeros((0, 3)), *(
+            turned @ (np.eye(3) - np.outer(self.axes[turn], self.axes[turn]))
+            for turn, turned in self.value.items())])
+        # about two axes, of the keyframes that have a pose
+        count = 2 * max(int(shaken.any(axis=1).sum()), 1)
+        return replace(self, readout_s=imaging.readout_s,
+                       bumps=float(np.sqrt(np.sum(shaken**2) / count)))
 
 
 # the residual distortion over the picture

@@ -152,6 +152,8 @@ def test_the_camera_from_the_name(tmp_path):
     earlier = rows_of(tmp_path, text, group_by=r'(?P<make>\w+)/(?P<camera>cam\d)')
     assert earlier[0].camera_model == 'acme'
     assert rows_of(tmp_path, 'clip,make\n1.mp4,acme\n')[0].camera_model == 'acme'
+    both = rows_of(tmp_path, 'clip,camera_model,make\n1.mp4,acme,\n')
+    assert both[0].camera_model == 'acme'
     assert rows_of(tmp_path, text, group_by=r'cam(\d)')[0].camera == '7'
     assert rows_of(tmp_path, text, group_by=r'cam\d')[0].camera == 'cam7'
     with pytest.raises(ConfigError) as caught:

@@ -266,7 +266,7 @@ def test_a_result_without_a_camera_of_ours_is_refused(tmp_path, changes, code):
 
 def test_different_image_sizes_are_an_error():
     for size, remedy in (((621, 187), "export 'my truth' --to ros --size 621x187 --out "),
-                       ((640, 480), '--crop')):
+                         ((640, 480), '--crop')):
         with refused(InputError, 'E-COMPARE-SIZE', '1242x375', '{}x{}'.format(*size), remedy):
             compare(dataclasses.replace(REFERENCE, name='my truth'),
                     NamedCamera('other', dataclasses.replace(TRUTH, image_size=size)))
