@@ -75,6 +75,7 @@ PARTS = (
     Part('moved', 5, 'a camera that is moved within a drive'),
     Part('poses', 20, 'true poses of KITTI 03'),
     Part('fleet', 60, '`dashcalib batch`: nothing lost, short clips, the prior, effort'),
+    Part('public_rows', 200, 'dashcalib and COLMAP on the drives of benchmark/public'),
     Part('rivals', 30, 'COLMAP and GLOMAP on the same images'),
     Part('engines', 15, 'the engines that estimate poses, COLMAP and OpenCV, on the same drives'),
     Part('speed', 20, 'time and memory of the command'),

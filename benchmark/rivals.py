@@ -30,6 +30,7 @@ import cv2
 import numpy as np
 from drives import BY_NAME, DEMO, KITTI_RAW, NARROW, STREET, Setting, drive_of, pictures_of
 from measure import (
+    Stopwatch,
     commit,
     complain,
     done,
@@ -177,39 +178,14 @@ def _ours(task: Task, detection: Detection, turns: Sequence[Turn]) -> dict[str, 
 
 def _colmap(task: Task, windows: Sequence[Turn], globally: bool = False) -> dict[str, Any]:
     """Return what COLMAP's defaults make of these windows; the largest model counts."""
-    import pycolmap
-    # a line for every image otherwise
-    pycolmap.logging.minloglevel = 2
     names = {frame.index for window in windows for frame in window.frames}
-    with tempfile.TemporaryDirectory() as folder:
-        root, database = Path(folder), Path(folder) / 'database.db'
-        (root / 'images').mkdir()
-        (root / 'sparse').mkdir()
-        # as they were recorded, not as dashcalib resizes them
-        for frame in task.frames:
-            if frame.index in names:
-                cv2.imwrite(str(root / 'images' / f'{frame.index:06}.png'), frame.image)
-        marks, before = [time.monotonic()], processor_s()
-        reader = pycolmap.ImageReaderOptions()
-        reader.camera_model = 'RADIAL'
-        pycolmap.extract_features(database, root / 'images', reader_options=reader,
-                                  camera_mode=pycolmap.CameraMode.SINGLE)
-        marks.append(time.monotonic())
-        if task.matcher == 'sequential':
-            pycolmap.match_sequential(database)
-        else:
-            pycolmap.match_exhaustive(database)
-        marks.append(time.monotonic())
-        if globally:
-            pycolmap.calibrate_view_graph(database)
-        mapping = pycolmap.global_mapping if globally else pycolmap.incremental_mapping
-        models = mapping(database, root / 'images', root / 'sparse')
-        marks.append(time.monotonic())
-    row: dict[str, Any] = {'seconds': marks[-1] - marks[0], 'cpu_s': processor_s() - before,
-                           'images': len(names), 'models': [],
-                           'stages': {'extract': marks[1] - marks[0],
-                                      'match': marks[2] - marks[1], 'map': marks[3] - marks[2]}}
-    for model in sorted(models.values(), key=lambda model: -model.num_reg_images()):
+    before = processor_s()
+    # as they were recorded, not as dashcalib resizes them
+    models, stages = colmap_models((frame for frame in task.frames if frame.index in names),
+                                   'RADIAL', task.matcher, globally)
+    row: dict[str, Any] = {'seconds': sum(stages.values()), 'cpu_s': processor_s() - before,
+                           'images': len(names), 'models': [], 'stages': stages}
+    for model in models:
         focal, cx, cy, k1, k2 = next(iter(model.cameras.values())).params
         # COLMAP has the first pixel's centre at (0.5, 0.5)
         estimate = {'fx': focal, 'fy': focal, 'cx': cx - 0.5, 'cy': cy - 0.5, 'k1': k1, 'k2': k2}
@@ -218,6 +194,37 @@ def _colmap(task: Task, windows: Sequence[Turn], globally: bool = False) -> dict
     if not row['models']:
         return {**row, 'registered': 0, 'reasons': ['no model']}
     return {**row, **row['models'][0]}
+
+
+def colmap_models(frames: Iterable[Frame], lens: str, matcher: str = 'sequential',
+                  globally: bool = False) -> tuple[list[Any], dict[str, float]]:
+    """Return the models of COLMAP's defaults, the largest first, and the seconds of each stage."""
+    import pycolmap
+    # a line for every image otherwise
+    pycolmap.logging.minloglevel = 2
+    with tempfile.TemporaryDirectory() as folder:
+        root, database = Path(folder), Path(folder) / 'database.db'
+        (root / 'images').mkdir()
+        (root / 'sparse').mkdir()
+        for frame in frames:
+            cv2.imwrite(str(root / 'images' / f'{frame.index:06}.png'), frame.image)
+        watch = Stopwatch('extract')
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model = lens
+        pycolmap.extract_features(database, root / 'images', reader_options=reader,
+                                  camera_mode=pycolmap.CameraMode.SINGLE)
+        watch.enter('match')
+        if matcher == 'sequential':
+            pycolmap.match_sequential(database)
+        else:
+            pycolmap.match_exhaustive(database)
+        watch.enter('map')
+        if globally:
+            pycolmap.calibrate_view_graph(database)
+        mapping = pycolmap.global_mapping if globally else pycolmap.incremental_mapping
+        models = mapping(database, root / 'images', root / 'sparse')
+        watch.enter('end')
+    return sorted(models.values(), key=lambda model: -model.num_reg_images()), watch.seconds
 
 
 def run(rival: str, task: Task) -> dict[str, Any]:

@@ -28,6 +28,8 @@ from dashcalib_ros.judge.difference import NamedCamera
 
 SOUND = 'radial', 'brown', 'fisheye', 'windscreen', 'shutter'
 HOPELESS = 'straight', 'stabilised'
+HEAD = ('calibrator', 'sound drives accepted', 'hopeless ones refused', 'fx off, %: median',
+        'most', 'rays off, px: median', 'most', 'within 1 sigma, %', '2 sigma')
 # K_00 and D_00 of KITTI raw, 2011-09-26, by chessboards
 BOARD = Brown.of((1392, 512), [984.2439, 980.8141, 690.0, 233.1966, -0.3728755, 0.2037299,
                                0.002219027, 0.001383707, -0.07233722])
@@ -69,11 +71,16 @@ def drives(seeds: Sequence[int]) -> list[Known]:
 
 
 def camera_in(folder: Path, name: str) -> NamedCamera | None:
-    """Return the camera of a drive; None where the folder has none. Raises InputError."""
+    """Return the camera of a drive; None where there is none, or a refusal. Raises InputError."""
     paths = [path for path in sorted(folder.iterdir()) if name in (path.name, path.stem)]
     if len(paths) > 1:
         raise InputError('E-SCORE-SEVERAL', f'{folder} has several files of {name}: keep one')
-    return load_camera(paths[0], nearest=True) if paths else None
+    try:
+        return load_camera(paths[0], nearest=True) if paths else None
+    except InputError as error:
+        if error.code != 'E-NO-INTRINSICS':
+            raise
+        return None
 
 
 def score(known: Known, found: NamedCamera | None) -> Score:
@@ -139,9 +146,7 @@ def main() -> None:
             rows.append(cells(folder.name, scores))
     except (DashcalibError, OSError) as error:
         sys.exit(str(error))
-    print(table(['calibrator', 'sound drives accepted', 'hopeless ones refused',
-                 'fx off, %: median', 'most', 'rays off, px: median', 'most',
-                 'within 1 sigma, %', '2 sigma'], rows))
+    print(table(HEAD, rows))
 
 
 if __name__ == '__main__':

@@ -165,13 +165,16 @@ def misfits(per_turn: Sequence[Scene], together: Sequence[Scene], camera: Camera
 
     per_turn: the turns as they were reconstructed, each with its own camera (one focal length,
     k1, k2). together: those that are left, adjusted with the shared camera. limit_px: larger
-    errors count as this. Costs are means over all observations. The ratio is about 1 or less for a
-    turn of the shared camera; a turn that is not in together costs limit_px squared.
+    errors count as this. Costs are means over all observations, also of points that are too far
+    away to be used. The ratio is about 1 or less for a turn of the shared camera; a turn that is
+    not in together costs limit_px squared.
     """
     adjusted = {scene.turn: scene for scene in together}
 
     def cost(scene: Scene, camera: Camera) -> float:
-        return max(truncated_cost(scene, camera, limit_px), LEAST_COST)
+        # at a fixed angle a shorter focal length has more points, and fewer errors only for that
+        whole = retriangulated(scene, camera, limit_px, min_angle_deg=0.0)
+        return max(truncated_cost(whole, camera, limit_px), LEAST_COST)
 
     return {scene.turn: (cost(adjusted[scene.turn], camera) if scene.turn in adjusted
                          else limit_px**2) / cost(scene, scene.camera) for scene in per_turn}

@@ -466,7 +466,8 @@ def test_misfits_are_ratios_of_costs():
     off = replace(LENS, fx=1.05 * LENS.fx)
     found = misfits([first, second], [replace(first, camera=off)], off, 2.0)
     assert found[at(0)] > 3 and list(found) == [at(0), at(1)]
-    assert found[at(1)] == pytest.approx(4.0 / truncated_cost(second, LENS, 2.0))
+    whole = retriangulated(second, LENS, 2.0, min_angle_deg=0.0)
+    assert found[at(1)] == pytest.approx(4.0 / truncated_cost(whole, LENS, 2.0))
     assert misfits([first], [first], LENS, 2.0) == {at(0): 1.0}
 
 
