@@ -142,6 +142,9 @@ def drive(frames: Iterable[Frame], turns: list[int], half_width: float
     finally:
         print(f'exit code on SIGINT: {node.stop()}', file=sys.stderr)
         node.kill()
+        # the next drive's node would see its publisher, too
+        bench.close()
+        rclpy.shutdown(context=context)
 
 
 def against(text: str | None, reference: dict[str, float]) -> list[list[str]]:

@@ -205,8 +205,10 @@ class Calibrating:
 
     def _adopt(self, calibration: Calibration) -> None:
         source = self.drive.source
+        # one that was started again is listed twice for a while
+        publishers = dict.fromkeys(self.drive.images.publishers)
         kept = StoredCalibration.of(calibration, self._whose, source.frame_id if source else '',
-                                    *self.drive.images.publishers)
+                                    ', '.join(publishers))
         info = self._use(kept)
         self._log.info(f'accepted: {sigma_text(kept.camera)}; {self.save()[1]}')
         if self._own.commit:

@@ -47,6 +47,16 @@ MOUNT = Mount('accepted', (), 2.0, -1.0, None, None,
                'height_m': None}, (600.0, 170.0), 0.5, 300.0)
 
 
+def test_a_driver_that_dds_lists_twice_costs_no_calibration(make_desk, make_bench):
+    """As for a while after it was killed and started again."""
+    desk = make_desk()
+    make_bench(listen=False)
+    desk.until(lambda: desk.bench.values['publishers'] == '/bench, /bench')
+    desk.give()
+    assert desk.show() == 400.0
+    assert yaml.safe_load(desk.file.read_text())['dashcalib']['publisher'] == '/bench'
+
+
 def test_its_life_with_a_camera_that_is_bumped(make_desk):
     desk = make_desk()
     desk.show()
