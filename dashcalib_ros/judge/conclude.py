@@ -315,6 +315,11 @@ def _warnings(found: CalibrationData, solution: Solution, evidence: Evidence
         f'known.{each.name} is {each.value:.5g}, and the turns say {each.by_turns:.5g} ± '
         f'{each.by_turns_sigma:.2g}: it does not count; correct it, or leave it out')
         for each in found.known if not each.used]
+    if found.config.known.stabiliser == 'no' and not solution.fixed:
+        warnings.append(Notice(
+            'E-KNOWN-CONTRADICTED',
+            'known.stabiliser is no, and the pictures move against the lens as with one: it does '
+            'not count; correct it, or leave it out'))
     if field is not None and field.used and field.rms_px >= REPORTED_FIELD_PX:
         warnings.append(Notice(
             'E-FIELD-LARGE',

@@ -397,7 +397,8 @@ def _solution(found: Estimate, unlike: Mapping[TurnId, float], coarse: Profile,
         misfits=unlike, tried=tried,
         fixed_camera=tests, field_sigma=found.imaging.smooth.sigma,
         crops={} if shift.only else dict(shift.value),
-        perhaps_shifted=shift.only or frozenset(), fixed=config.known.stabiliser == 'no',
+        perhaps_shifted=shift.only or frozenset(),
+        fixed=config.known.stabiliser == 'no' and not found.moves,
         unsettled=_unsettled(result, posterior.covariance, found.last))
 
 

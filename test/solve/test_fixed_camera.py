@@ -16,6 +16,7 @@ from dashcalib_ros.judge.conclude import Evidence, conclude
 from dashcalib_ros.judge.verdict import STEADY, judge
 from dashcalib_ros.problem.blocks import Shift, Zoom, imaging_with
 from dashcalib_ros.reconstruct.scene import Scene
+from dashcalib_ros.solve import evidence
 
 # what the others are measured against: nothing is taken out
 KEPT = CONFIG.replace({'intrinsics.crop_rounds': 0})
@@ -88,6 +89,23 @@ def test_a_stabilised_video_is_found_and_taken_out():
     taken = np.concatenate([found.crops[scene.turn][:, 0] for scene in scenes])
     there = np.concatenate([stabilised(scene)[:, 0, 0] for scene in scenes])
     assert np.corrcoef(taken, there)[0, 1] > 0.95
+
+
+def test_a_stabiliser_that_somebody_denies_is_found_and_named():
+    denied = CONFIG.replace({'known.stabiliser': 'no'})
+    still, found = (solved(scenes, denied) for scenes in (
+        scenes_of(4), moved(scenes_of(4, tracks=200, keyframes=16, noise_px=0.15), stabilised)))
+    assert still.fixed and not found.fixed and found.crops
+    codes = [[each.code for each in conclude(each, Evidence(
+        SIZE, 100, (), {}, np.zeros((0, 2)), None, FULL_SIZE, {}), denied).warnings]
+        for each in (still, found)]
+    assert 'E-KNOWN-CONTRADICTED' in codes[1] and 'E-KNOWN-CONTRADICTED' not in codes[0]
+
+
+def test_who_knows_that_there_is_no_stabiliser_is_believed_against_little_evidence(monkeypatch):
+    monkeypatch.setattr(evidence, 'SHIFT_NATS', -2.0)
+    for known, shifted in (({}, True), ({'known.stabiliser': 'no'}, False)):
+        assert bool(solved(scenes_of(4), CONFIG.replace(known)).crops) == shifted
 
 
 def test_a_crop_is_taken_out_of_the_tracks():
