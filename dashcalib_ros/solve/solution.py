@@ -102,12 +102,12 @@ class Solution:
     that it is not first. crops: by turn (k, 2) px, how far a stabiliser moved each keyframe's
     picture; empty for a fixed picture. perhaps_shifted: turns so gentle that a stabiliser might
     have shifted their pictures: each may be, and sigma contains it. fixed: it is known that there
-    is no stabiliser, and the pictures do not move. drift: of the focal length, which is that of the middle of the drive then;
-    parts: of a step, the solutions of the turns before it and of those later. unsettled: how far
-    the last step moved the rays over the picture, in their sigma. field_sigma: px, of the prior of
-    the field's directions.
-    by_pictures: the solution of the pictures alone, where a gyro's angles are in this one. px: of
-    the input's pictures, in one pixel of the scenes.
+    is no stabiliser, and the pictures do not move. drift: of the focal length, which is that of
+    the middle of the drive then; parts: of a step, the solutions of the turns before it and of
+    those later. unsettled: how far the last step moved the rays over the picture, in their sigma.
+    field_sigma: px, of the prior of the field's directions. by_pictures: the solution of the
+    pictures alone, where a gyro's angles are in this one. px: of the
+    input's pictures, in one pixel of the scenes.
     """
 
     written: Written
