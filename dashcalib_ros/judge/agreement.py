@@ -99,14 +99,18 @@ def outdated(turns: Set[TurnId], of_another: Set[TurnId]) -> set[TurnId]:
     return set(turns - of_another) if len(newest) == 2 and of_another >= set(newest) else set()
 
 
-def focal_disagreement(solution: Solution) -> float:
-    """Return the weighted scatter between the turns' own fx, relative to fx."""
+def focal_disagreement(solution: Solution, beyond_sigma: bool = False) -> float:
+    """Return the weighted scatter between the turns' own fx, relative to fx.
+
+    beyond_sigma: without what their own sigmas explain.
+    """
     if len(solution.scenes) < 2:
         return 0.0
     own = list(focal_of_turns(solution).values())
     mean = weighted_mean(np.array([turn.fx for turn in own]),
                          np.array([turn.sigma**2 for turn in own]))
-    return float(np.sqrt(mean.squares * mean.variance) / solution.camera.fx)
+    squares = max(0.0, mean.squares - (mean.count - 1)) if beyond_sigma else mean.squares
+    return float(np.sqrt(squares * mean.variance) / solution.camera.fx)
 
 
 def leverages(solution: Solution) -> dict[TurnId, float]:

@@ -224,10 +224,11 @@ MIN_CONTRAST, REFUSED_CONTRAST = 0.05, 0.01
 
 def flat_profile(grounds: Grounds) -> Finding:
     """The cost must rise on both sides of its minimum, or the focal length is not observable."""
-    contrast, least = profile_contrast(grounds.solution), MIN_CONTRAST
+    contrast = profile_contrast(grounds.solution)
     # of gentle bends the sigma says how well it is known; the profile may only not contradict it
     refused = REFUSED_CONTRAST if _has_turn(grounds.solution) else -MIN_CONTRAST
-    percent = 100 * max(contrast, 0.0)
+    least = 0.0 if _sigma_decides(grounds.solution) else MIN_CONTRAST
+    percent = 100 * (contrast if least == 0.0 else max(contrast, 0.0))
     return Finding(
         # written with not: a contrast of NaN is refused, too
         'E-FLAT-PROFILE', _graded(not contrast >= refused, contrast < least),
@@ -239,6 +240,11 @@ def flat_profile(grounds: Grounds) -> Finding:
 
 def _has_turn(solution: Solution) -> bool:
     return any(scene.yaw_deg >= HIDDEN_DEG for scene in solution.scenes)
+
+
+def _sigma_decides(solution: Solution) -> bool:
+    """Return whether bumps and gentle bends count in full, which contain little besides."""
+    return solution.fixed and not _has_turn(solution)
 
 
 def profile_contrast(solution: Solution) -> float:
@@ -302,7 +308,9 @@ MAX_DISAGREEMENT = 0.03
 
 def turns_disagree(grounds: Grounds) -> Finding:
     """Compare the values of fx that the turns would give separately."""
-    spread, most = focal_disagreement(grounds.solution), MAX_DISAGREEMENT
+    # each stretch without a turn knows fx to a few percent
+    spread = focal_disagreement(grounds.solution, _sigma_decides(grounds.solution))
+    most = MAX_DISAGREEMENT
     return Finding('E-TURNS-DISAGREE', _graded(False, spread > most),
                    f'the turns disagree about the focal length by {100 * spread:.1f} %, at most '
                    f'{100 * most:.0f} % is usual',

@@ -304,6 +304,17 @@ def test_a_flat_profile(good, costs, contrast, level):
     assert ('E-FLAT-PROFILE' in reasons) == (level != 'accepted')
 
 
+@pytest.mark.parametrize(('yaw_deg', 'fixed', 'costs', 'weak'), [
+    (10.0, True, (0.301, 0.300, 0.301), False), (10.0, False, (0.301, 0.300, 0.301), True),
+    (90.0, True, (0.31, 0.300, 0.309), True), (10.0, True, (0.299, 0.300, 0.301), True)])
+def test_of_gentle_stretches_without_a_stabiliser_sigma_decides(
+        good, monkeypatch, yaw_deg, fixed, costs, weak):
+    """The profile may only not contradict it, and they may scatter as their sigmas say."""
+    monkeypatch.setattr(type(good.scenes[0]), 'yaw_deg', yaw_deg)
+    _, reasons = levels(replace(with_profile(good, (0.8, 1.0, 1.25), costs), fixed=fixed))
+    assert ('E-FLAT-PROFILE' in reasons) == weak
+
+
 def test_another_focal_length_that_explains_more(good):
     level, reasons = levels(with_profile(good, (0.8, 1.0, 1.25, 1.9), (0.5, 0.4, 0.5, 0.2)))
     assert level == 'refused'
@@ -375,6 +386,12 @@ def test_turns_that_disagree_are_weak(good):
     level, reasons = levels(solution)
     assert level == 'weak' and 'E-TURNS-DISAGREE' in reasons
     assert focal_disagreement(only(good, [0])) == 0.0
+    # the same values, each known to 20 % only
+    unsure = with_turns(solution, [
+        replace(turn, score=turn.score / 1e6, hessian=turn.hessian / 1e6,
+                by_track=turn.by_track / 1e6) for turn in solution.posterior.turns])
+    assert focal_disagreement(unsure) > 0.03 and focal_disagreement(unsure, True) == 0.0
+    assert focal_disagreement(solution, True) > 0.03
 
 
 @pytest.mark.parametrize('name', ['fx', 'cy', 'k2'])
