@@ -232,6 +232,8 @@ def flat_profile(grounds: Grounds) -> Finding:
     return Finding(
         # written with not: a contrast of NaN is refused, too
         'E-FLAT-PROFILE', _graded(not contrast >= refused, contrast < least),
+        f'a focal length 20 % off would explain the pictures better (the error falls by '
+        f'{-percent:.1f} %)' if percent < 0.0 else
         f'a focal length 20 % off would explain the pictures almost as well (the error rises by '
         f'{percent:.1f} %, at least {100 * least:.0f} % is needed)',
         MORE_TURNS).measured('rise of the error when the focal length is 20 % off',
