@@ -99,9 +99,12 @@ def main() -> None:
         ran = [known for known in chosen if f'{calibrator} | {known.name}' in rows]
         if not ran:
             continue
-        scores = [score(known, camera_in(args.out / 'public' / calibrator, known.name))
-                  for known in ran]
-        whole.append(cells(calibrator, scores))
+        folder = args.out / 'public' / calibrator
+        folder.mkdir(parents=True, exist_ok=True)
+        scores = [score(known, camera_in(folder, known.name)) for known in ran]
+        # what was not done is no refusal
+        if ended := [each for each in scores if done(rows[f'{calibrator} | {each.known.name}'])]:
+            whole.append(cells(calibrator, ended))
         for known, scored in zip(ran, scores, strict=True):
             row = rows[f'{calibrator} | {known.name}']
             each.append([known.name, calibrator, row['said'], number(scored.off_percent, '+.2f'),
