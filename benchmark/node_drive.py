@@ -4,10 +4,9 @@
     python benchmark/node_drive.py [--data DIR] [--repeat N] [--results]
 
 The demo's drive, with exact truth; with --data also KITTI 03, against `dashcalib run`, and N more
-times against its poses. Tells when
-camera_info began, counted from the end of the turn that completes the evidence; how many images
-after that were without one; how many pairs a rectifier gets that matches stamps exactly; what the
-node warned of; and the result beside the reference.
+times against its poses. Tells when camera_info began, counted from the end of the turn that
+completes the evidence; how many images after that were without one; how many pairs a rectifier
+gets that matches stamps exactly; what the node warned of; and the result beside the reference.
 """
 from __future__ import annotations
 

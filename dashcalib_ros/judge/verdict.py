@@ -245,7 +245,7 @@ def _has_turn(solution: Solution) -> bool:
 
 
 def _sigma_decides(solution: Solution) -> bool:
-    """Return whether bumps and gentle bends count in full, which contain little besides."""
+    """Return whether nothing but gentle stretches was seen, and no stabiliser shifted them."""
     return solution.fixed and not _has_turn(solution)
 
 
@@ -310,7 +310,7 @@ MAX_DISAGREEMENT = 0.03
 
 def turns_disagree(grounds: Grounds) -> Finding:
     """Compare the values of fx that the turns would give separately."""
-    # each stretch without a turn knows fx to a few percent
+    # each gentle stretch alone knows fx to a few percent: such scatter is no disagreement
     spread = focal_disagreement(grounds.solution, _sigma_decides(grounds.solution))
     most = MAX_DISAGREEMENT
     return Finding('E-TURNS-DISAGREE', _graded(False, spread > most),

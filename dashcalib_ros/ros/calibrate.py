@@ -205,7 +205,7 @@ class Calibrating:
 
     def _adopt(self, calibration: Calibration) -> None:
         source = self.drive.source
-        # one that was started again is listed twice for a while
+        # DDS lists a driver twice for a while after it was killed and started again
         publishers = dict.fromkeys(self.drive.images.publishers)
         kept = StoredCalibration.of(calibration, self._whose, source.frame_id if source else '',
                                     ', '.join(publishers))

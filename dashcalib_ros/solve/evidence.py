@@ -59,8 +59,8 @@ LEFT_SHIFT = 4.0
 MATTERS: Mapping[Kind, float] = {'shift': 0.004, 'zoom': 0.004, 'bend': 0.3}
 # sigmas of a slow shift, of the width, among which the evidence chooses, and the nats it takes
 SHIFT_SIZES, SHIFT_NATS = (0.0005, 0.001, 0.002, 0.004, 0.008, 0.016), 3.0
-# more of them against somebody who knows that there is no stabiliser, right 99 times of 100: ten
-# stretches of a highway, with a fixed camera, have 3.2 for one
+# nats that it takes in addition where the user says that there is no stabiliser: the logarithm of
+# 100, as users are right 99 times of 100. Ten stretches of a highway from a fixed camera have 3.2
 AGAINST_KNOWN_NATS = 4.6
 # degrees of yaw: a stabiliser hides less in a stretch; more shows whether there is one
 HIDDEN_DEG, SHARP_DEG = 20.0, 45.0
