@@ -30,9 +30,9 @@ Source = Callable[[str], list[str]]
 class Figure:
     """A place on a page that says what a table says.
 
-    place: text of the page, once in it, however wrapped; each # is a number, @ the table's commits
-    as its link. sources: what returns the numbers, in their order, from the table's text; [] where
-    it does not.
+    place: text of the page, once in it, however wrapped; each # is a number, @ the link to the
+    table, whose text is the table's commits. sources: what returns the numbers, in their order,
+    from the table's text; [] where it does not.
     """
 
     page: str
@@ -44,12 +44,8 @@ class Figure:
     def pattern(self) -> re.Pattern[str]:
         """Return what the place looks like with any figures."""
         spaced = re.escape(self.place).replace('\\ ', r'\s+').replace('\\#', f'({NUMBER})')
-        return re.compile(spaced.replace('@', rf'(\[{COMMITS}\]\({re.escape(self.link)}\))'))
-
-    @property
-    def link(self) -> str:
-        """Return the link from the page to the table."""
-        return f'{"../" * self.page.count("/")}benchmark/results/{self.table}.md'
+        link = f'{"../" * self.page.count("/")}benchmark/results/{self.table}.md'
+        return re.compile(spaced.replace('@', rf'\[{COMMITS}\]\({re.escape(link)}\)'))
 
     def with_figures(self, text: str) -> str:
         """Return the page's text with the table's figures in the place. Raises ValueError."""
@@ -57,17 +53,20 @@ class Figure:
         numbers = [number for source in self.sources for number in source(table)]
         if len(numbers) != self.place.count('#'):
             raise ValueError(f'{self.table}.md has {numbers} for "{self.place}" of {self.page}')
-        commits = f'[{commits_of(table)}]({self.link})'
-        new = [commits if each == '@' else numbers.pop(0)
-               for each in re.findall('[#@]', self.place)]
         places = [*self.pattern.finditer(text)]
         if len(places) != 1:
             raise ValueError(f'{self.page} has {len(places)} places "{self.place}", not one')
         # lines end where they did
-        for group in reversed(range(len(new))):
+        for group in reversed(range(len(numbers))):
             begin, end = places[0].span(group + 1)
-            text = text[:begin] + new[group] + text[end:]
+            text = text[:begin] + numbers[group] + text[end:]
         return text
+
+
+def with_commits(text: str) -> str:
+    """Return a page's text with the commits of each table that it links to by its commits."""
+    return re.sub(rf'\[{COMMITS}\](?=\([./]*benchmark/results/(\w+)\.md\))',
+                  lambda link: f'[{commits_of(table_of(link[1]))}]', text)
 
 
 def table_of(name: str) -> str:
@@ -287,6 +286,12 @@ FIGURES = (
            'without_turns', (without_turns('no'),)),
     Figure(PROOF, '| # pieces, # with an fx, at best weak: # sigmas RMS off, # beyond 2; sigma # '
            '% | @ |', 'without_turns', (without_turns('not known'),)),
+    Figure(PROOF, '| # of # accepted: # and # px, # and # sigmas off | @ |', 'without_turns', (
+        found(r'Fleets, stabiliser no: (?P<b>\d+) drives, \d+ numbers, (?P<a>\d+) accepted'),
+        found(r'(?s)\| kitti03 \| fleet .*?\| (\d+\.\d ± \d+\.\d) \|.*?'
+              r'\| carnd \| fleet .*?\| (\d+\.\d ± \d+\.\d) \|'),
+        found(r'(?s)\| kitti03 \| fleet [^\n]*[-+]([\d.]+) \|\n.*?'
+              r'\| carnd \| fleet [^\n]*[-+]([\d.]+) \|\n'))),
     Figure(PROOF, '| fx # and # px | @ |', 'node_drive', (
         found(r'fx (\d+\.\d ± \d+\.\d) px', r'(?s)KITTI 03.*?\| fx \| (\d+\.\d)'),
         found(r'with other turns: (\d+\.\d ± \d+\.\d)', r'(?s)KITTI 03.*?reference (\d+\.\d)'))),
@@ -390,6 +395,7 @@ def pages(parts: str | None = None) -> tuple[dict[str, str], list[str]]:
             texts[figure.page] = figure.with_figures(texts[figure.page])
         except ValueError as error:
             wrong.append(str(error))
+    texts = {name: with_commits(text) for name, text in texts.items()}
     if parts is not None:
         name = 'benchmark/README.md'
         before, _, rest = (ROOT / name).read_text('utf-8').partition(PARTS[0])

@@ -15,7 +15,16 @@ if not FOLDER.is_dir():
     pytest.skip('the source distribution has no benchmarks', allow_module_level=True)
 sys.path.append(str(FOLDER))
 import figures  # noqa: E402 (benchmarks are no package)
-from figures import FIGURES, PARTS, README, Figure, cell, commits_of, table_of  # noqa: E402
+from figures import (  # noqa: E402
+    FIGURES,
+    PARTS,
+    README,
+    Figure,
+    cell,
+    commits_of,
+    table_of,
+    with_commits,
+)
 
 
 @pytest.mark.parametrize('figure', FIGURES, ids=lambda figure: f'{figure.page} {figure.table}')
@@ -47,7 +56,7 @@ def test_a_cited_commit_is_one_of_the_table_beside_it(page):
                        r'results/(\w+)\.md\)', text)
     assert cited
     for commits, table in cited:
-        assert commits == commits_of(table_of(table)), table
+        assert commits == commits_of(table_of(table)), f'{table}: python -m benchmark figures'
 
 
 def test_the_tables_are_from_commits_of_this_repository():
@@ -69,9 +78,9 @@ def test_figures_are_put_where_they_belong(tmp_path, monkeypatch):
         '|---|---|\n| one | 700.5 ± 1.5, 2 |\n<!-- end -->\n')
     figure = Figure('page', 'fx # px, at @.', 'made', (cell('one', 'fx, px'),))
     link = '(benchmark/results/made.md)'
-    said = figure.with_figures(f'It says fx 3.1 px, at [1111111]{link}.')
+    said = with_commits(figure.with_figures(f'It says fx 3.1 px, at [1111111]{link}.'))
     assert said == f'It says fx 700.5 ± 1.5 px, at [0123abc, 4567def]{link}.'
-    assert figure.with_figures(said) == said
+    assert with_commits(figure.with_figures(said)) == said
     for wrong in (Figure('page', 'fy #', 'made', figure.sources),
                   Figure('page', 'fx # and #', 'made', figure.sources),
                   Figure('page', 'fx # px', 'made', (cell('two', 'fx, px'),))):
