@@ -31,6 +31,7 @@ from dashcalib_ros.detect import Turn
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import DashcalibError
 from dashcalib_ros.input import Frame
+from dashcalib_ros.input.motion import SensorStream
 from dashcalib_ros.judge import CalibrationData
 from dashcalib_ros.judge.conclude import conclude, evidence_of_detection
 from dashcalib_ros.reconstruct import load as load_engine
@@ -207,7 +208,8 @@ class Stopwatch:
         self._stage, self._since = stage, now
 
 
-def calibrate(frames: Iterable[Frame], config: Config) -> tuple[CalibrationData, dict[str, float]]:
+def calibrate(frames: Iterable[Frame], config: Config, motion: SensorStream | None = None
+              ) -> tuple[CalibrationData, dict[str, float]]:
     """Return the calibration, and the seconds of each stage.
 
     decode: getting the frames; push: all of detection, with waiting for scenes; then whatever
@@ -215,6 +217,8 @@ def calibrate(frames: Iterable[Frame], config: Config) -> tuple[CalibrationData,
     """
     watch = Stopwatch('decode')
     with Calibrator(config) as calibrator:
+        if motion is not None:
+            calibrator.sense(motion)
         for frame in frames:
             watch.enter('push')
             calibrator.push(frame)

@@ -9,9 +9,10 @@
 Real drives are cut into pieces of so many seconds; a piece with a turn of 20 degrees or more is
 left out. A seed draws a camera and a street as population.py does, and a drive of 10 to 40 s
 with bumps: straight with lane keeping, or bends of 100 to 800 m radius. Each is calibrated
-twice: without knowing anything, and with known.stabiliser=no. --spoilt: rendered drives whose
-pictures a stabiliser moved, or that were zoomed or cropped; nothing is known of them. --fleet:
-pieces without a sharp turn, as the clips of one camera of a fleet; there is no stabiliser.
+three times: without knowing anything, with known.stabiliser=no, and with nothing but the speed
+of the car and known.height, to 2 cm. --spoilt: rendered drives whose pictures a stabiliser moved,
+or that were zoomed or cropped; nothing is known of them, or speed and height. --fleet: pieces
+without a sharp turn, as the clips of one camera of a fleet; there is no stabiliser.
 Rows go to DIR/without_turns.json; what is there is not run again. --results writes the table into
 benchmark/results/without_turns.md.
 """
@@ -32,14 +33,22 @@ from attacks import Film, shifted, stepped, swings, warped, with_pictures, zoome
 from mapping import GRID
 from measure import calibrate as calibrate_frames
 from measure import commit, isolated, keep_table, load, parser_with, save, table
+from mount import speed_of
 from population import closest_cameras, rays_of
 from population import drive_of as camera_and_street
 
 from dashcalib_ros import Config, calibrate, open_frames
 from dashcalib_ros.demo import Drive, Turn
+from dashcalib_ros.demo.vehicle import MARGIN_S
 from dashcalib_ros.formats.ours import load_calibration
+from dashcalib_ros.input.motion import Samples, SensorStream
+from dashcalib_ros.input.poses import read_poses
 from dashcalib_ros.judge import CalibrationData
 
+# what is known of the camera, as the table says it; 'height' is m above the road
+KNOWN = {'not known': '', 'no': 'no', 'not known; speed and height are': 'height'}
+# m, of KITTI's cars (nominal); what a tape measure is worth
+KITTI_M, TAPE_M = 1.65, 0.02
 # input, images per second of folders, and the truth of fx with its sigma, px
 DRIVES = {'kitti03': ('bag', None, 718.2, 1.8), 'kitti07': ('images', 9.65, 701.9, 1.4),
           'kitti_raw': ('images', 9.7, 981.5, 3.0), 'carnd': ('drive.mp4', None, 1161.0, 10.0)}
@@ -118,12 +127,33 @@ def row_of(found: CalibrationData, fx: float, fx_sigma: float) -> dict[str, Any]
             'sigmas': off / float(np.hypot(sigma, fx_sigma))}
 
 
-def piece(data: Path, name: str, start_s: float, seconds: float, stabiliser: str
-          ) -> dict[str, Any]:
+def knowing(known: str, height_m: float) -> Config:
+    """Return the settings where this is known, of KNOWN."""
+    return Config.of({'known.height': f'{height_m}±{TAPE_M}'} if known == 'height' else
+                     {'known.stabiliser': known})
+
+
+def speed_from(folder: Path, place: str, fps: float | None, start_s: float) -> SensorStream:
+    """Return the speed of a car of KITTI, from the first image behind start_s on."""
+    stamps = np.array([frame.stamp_ns / 1e9 for frame in open_frames(folder / place, fps=fps)])
+    first = stamps[stamps >= stamps[0] + start_s - 1e-6][0] - stamps[0]
+    if (folder / 'oxts.csv').exists():
+        with open(folder / 'oxts.csv', encoding='utf-8', newline='') as stream:
+            rows = np.array([[float(row[name]) for name in ('stamp_s', 'vf', 'vl')]
+                             for row in csv.DictReader(stream)])
+        return SensorStream(speed=Samples(rows[:, 0] - first,
+                                          np.hypot(rows[:, 1], rows[:, 2])[:, None]))
+    positions = read_poses(folder / 'poses.txt').positions
+    count = min(len(positions), len(stamps))
+    return speed_of(stamps[:count] - stamps[0] - first, positions[:count])
+
+
+def piece(data: Path, name: str, start_s: float, seconds: float, known: str) -> dict[str, Any]:
     """Calibrate one piece (in a process of its own)."""
     place, fps, fx, fx_sigma = DRIVES[name]
+    motion = speed_from(data / name, place, fps, start_s) if known == 'height' else None
     found = calibrate(data / name / place, fps=fps, start_s=start_s, duration_s=seconds,
-                      config=Config.of({'known.stabiliser': stabiliser}))
+                      motion=motion, config=knowing(known, KITTI_M))
     return row_of(found, fx, fx_sigma)
 
 
@@ -154,8 +184,8 @@ def fleet(data: Path, name: str, seconds: float) -> dict[str, Any]:
         return {**row_of(found, fx, fx_sigma), 'yaw': None, 'scenes': turns}
 
 
-def rendered(seed: int, spoilt: str, stabilisers: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Calibrate a rendered drive (in a process of its own); return a row for each stabiliser."""
+def rendered(seed: int, spoilt: str, knowns: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Calibrate a rendered drive (in a process of its own); return a row for what is known."""
     cv2.setNumThreads(1)
     drive, rows = gentle_drive(seed), dict[str, dict[str, Any]]()
     film, lens = film_of(drive), drive.lens
@@ -165,12 +195,14 @@ def rendered(seed: int, spoilt: str, stabilisers: Sequence[str]) -> dict[str, di
                        np.linspace(0, lens.height - 1, GRID[1]))
     pixels = np.column_stack([x.ravel(), y.ravel()])
     cameras = closest_cameras(lens, rays_of(lens, pixels), pixels)
-    for stabiliser in stabilisers:
-        found, _ = calibrate_frames(iter(film.frames),
-                                    Config.of({'known.stabiliser': stabiliser}))
+    times = np.arange(0.0, drive.times[-1], 0.01)
+    speed = speed_of(times, drive.ride.camera_at(times + MARGIN_S)[1])
+    for known in knowns:
+        found, _ = calibrate_frames(iter(film.frames), knowing(known, drive.spec.height_m),
+                                    speed if known == 'height' else None)
         model = '' if found.camera is None else found.camera.model
-        rows[stabiliser] = {**row_of(found, cameras.get(model, {}).get('fx', np.nan), 0.0),
-                            'model': model, 'seconds': float(film.seconds[-1])}
+        rows[known] = {**row_of(found, cameras.get(model, {}).get('fx', np.nan), 0.0),
+                       'model': model, 'seconds': float(film.seconds[-1])}
     return rows
 
 
@@ -208,10 +240,11 @@ def main() -> None:
 
     for name in args.drives:
         for start in args.seconds * np.arange(args.pieces):
-            for stabiliser in ('', 'no'):
-                key = f'{name} | {start:.0f} | {args.seconds:.0f} s | {stabiliser or "not known"}'
-                if key not in rows:
-                    done = isolated(piece, args.data, name, float(start), args.seconds, stabiliser)
+            for words, known in KNOWN.items():
+                key = f'{name} | {start:.0f} | {args.seconds:.0f} s | {words}'
+                # nobody knows the speed of the highway's car
+                if key not in rows and (known != 'height' or name.startswith('kitti')):
+                    done = isolated(piece, args.data, name, float(start), args.seconds, known)
                     keep(key, done.value, done.failure)
     for name in FLEETS if args.fleet else ():
         key = f'{name} | fleet of {FLEETS[name][1]} clips | {args.seconds:.0f} s | no'
@@ -220,13 +253,12 @@ def main() -> None:
             keep(key, done.value, done.failure)
     for seed in args.seeds:
         for spoilt in ('', *args.spoilt):
-            stabilisers = ('',) if spoilt else ('', 'no')
-            keys = [f'{seed} | {spoilt or "as it is"} | rendered | {stabiliser or "not known"}'
-                    for stabiliser in stabilisers]
-            if not all(key in rows for key in keys):
-                done = isolated(rendered, seed, spoilt, stabilisers)
-                for key, stabiliser in zip(keys, stabilisers, strict=True):
-                    keep(key, (done.value or {}).get(stabiliser), done.failure)
+            keys = {f'{seed} | {spoilt or "as it is"} | rendered | {words}': known
+                    for words, known in KNOWN.items() if not spoilt or known != 'no'}
+            if missing := {key: known for key, known in keys.items() if key not in rows}:
+                done = isolated(rendered, seed, spoilt, [*missing.values()])
+                for key, known in missing.items():
+                    keep(key, (done.value or {}).get(known), done.failure)
     # a piece may be beyond the end of its drive, or have a turn
     kept = {key: row for key, row in rows.items() if row['verdict'] != 'failed' and row['scenes']
             and not ((row['yaw'] or 0.0) >= SHARP and key.startswith(tuple(DRIVES)))}
@@ -244,7 +276,7 @@ def main() -> None:
             ('Fleets', lambda key: 'fleet' in key),
             ('Rendered', lambda key: 'as it is' in key),
             ('Spoilt', lambda key: 'rendered' in key and 'as it is' not in key)):
-        for known in ('not known', 'no'):
+        for known in KNOWN:
             chosen = [row for key, row in kept.items()
                       if belongs(key) and key.endswith(f'| {known}')]
             if chosen:

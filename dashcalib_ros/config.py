@@ -129,6 +129,9 @@ class KnownConfig:
         pattern=rf'({NUMBER}±{NUMBER})?')
     aspect: str = setting(
         '', 'fy / fx: 1, 1±0.001', pattern=rf'({NUMBER}(±{NUMBER})?)?')
+    height: str = setting(
+        '', 'm above the road: 1.45±0.03; with a speed it tells fx, to a rig the metres',
+        pattern=rf'({NUMBER}(±{NUMBER})?)?')
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,8 @@ from dashcalib_ros.input import Frame
 from dashcalib_ros.input.inputs import Paths
 from dashcalib_ros.input.motion import Samples, speeds_of
 from dashcalib_ros.input.scale import Scale
+from dashcalib_ros.judge.known import value_of
+from dashcalib_ros.judge.mount import HEIGHT_FLOOR, log_height
 from dashcalib_ros.pipeline import Calibrator
 from dashcalib_ros.report import Calibration
 from dashcalib_ros.rig.dense import Retraced, retraced
@@ -66,6 +68,8 @@ from dashcalib_ros.workers.worker import Progress
 GRID_S = 0.1
 # pairs of images in which two cameras are matched, and s that these may be apart
 PICTURES, TOGETHER_S = 12, 0.012
+# s; beside a stretch of which a speed is known, it is not
+NEXT_S = 1e-3
 # sigmas of a rotation, and degrees, that the epipolar geometry of matches may be off
 CONTRADICTED, LEAST_APART_DEG = 3.0, 0.15
 
@@ -112,13 +116,17 @@ def rig_of_drives(drives: Mapping[str, Recording], base: str | None = None,
 
     drives: by the cameras' names. base: the name of the camera that the others are placed
     against; None: the first one whose lens is accepted. place: of a camera's result, for the file.
-    match: use matches between cameras, too. Raises InputError.
+    match: use matches between cameras, too. known.height is that of the base, or of the first
+    camera. Raises InputError.
     """
     config, observer = config or Config(), observer or Observer()
     if base not in (None, *drives) or len(drives) < 2:
         raise InputError('E-RIG-CAMERAS', f'a rig needs two cameras, and its base, {base}, is one '
                          f'of them: name them as front=front.mp4 left=left.mp4')
-    learned = {name: _learn(name, drive, config, observer) for name, drive in drives.items()}
+    measured = base or next(iter(drives))
+    learned = {name: _learn(name, drive, config if name == measured and drive.motion else replace(
+        config, known=replace(config.known, height='')), observer)
+               for name, drive in drives.items()}
     found = {name: coarse_paths(name, each.solution, each.start_s)
              for name, each in learned.items()}
     base = base or best_base({name: each.calibration.verdict.level
@@ -136,7 +144,9 @@ def rig_of_drives(drives: Mapping[str, Recording], base: str | None = None,
     alone = {name: Alone(place(name), each.calibration.verdict.level, each.start_s,
                          len(found[name].scenes)) for name, each in learned.items()}
     mount = learned[base].calibration.mount
-    return Rig(rig_of_paths(alone, base, turned, paths, _metres(learned, again.late), config.rig,
+    metres = (_by_speed(learned, again.late)
+              or _by_height(learned[measured], config, again.late.get(measured)))
+    return Rig(rig_of_paths(alone, base, turned, paths, metres, config.rig,
                             lambda best, use: _witnessed(learned, best, matches,
                                                          match and use),
                             None if mount is None else mount.rotation),
@@ -325,18 +335,47 @@ def _contradicted(shown: Matched, across: Floats, best: Solved) -> float:
     return float(np.degrees(np.linalg.norm(away))) if beyond.any() else 0.0
 
 
-def _metres(learned: Mapping[str, Learned], late: Mapping[str, float]) -> Metres | None:
-    """Return the speed of the car, where a drive has one. late: of clocks, the base's first."""
+def _by_speed(learned: Mapping[str, Learned], late: Mapping[str, float]) -> Metres | None:
+    """Return the metres by the speed of the car, where a drive has one.
+
+    late: of clocks, the base's first.
+    """
     for name, offset in late.items():
         each = learned[name]
         speed = each.drive.motion and speeds_of(each.drive.motion.since(each.start_s))
         if speed:
-            return _speed(speed, offset)
+            return _at(speed, offset, 0.0)
     return None
 
 
-def _speed(speed: Samples, offset: float) -> Metres:
-    return lambda seconds: speed.at(seconds + offset)[:, 0]
+def _by_height(camera: Learned, config: Config, late: float | None) -> Metres | None:
+    """Return the metres by the known height of a camera above the road; None: nothing known.
+
+    late: of its clock; None where it is not aligned with the base.
+    """
+    mount, times, speeds = camera.calibration.mount, list[Floats](), list[Floats]()
+    if not config.known.height or mount is None or camera.solution is None or late is None:
+        return None
+    height, sigma = value_of(config.known.height, 'height')
+    for scene in ordered(camera.solution):
+        found = log_height(scene, -mount.rotation[2])
+        seconds = scene.tracks.stamps_ns[scene.structure.registered] / 1e9 - camera.start_s
+        # turns may overlap
+        if found is not None and (not times or seconds[0] - NEXT_S > times[-1][0]):
+            ways = np.linalg.norm(np.diff(scene.structure.path()[1], axis=0), axis=1)
+            speed = ways / np.diff(seconds) * height / np.exp(found[0])
+            # nothing is known between stretches
+            times += [seconds[:1] - NEXT_S, seconds[:1], (seconds[1:] + seconds[:-1]) / 2,
+                      seconds[-1:], seconds[-1:] + NEXT_S]
+            speeds += [np.zeros(1), speed[:1], speed, speed[-1:], np.zeros(1)]
+    if not times:
+        return None
+    return _at(Samples(np.concatenate(times), np.concatenate(speeds)[:, None]), late,
+               float(np.hypot(sigma / height, HEIGHT_FLOOR)))
+
+
+def _at(speed: Samples, offset: float, sigma: float) -> Metres:
+    return Metres(lambda seconds: speed.at(seconds + offset)[:, 0], sigma)
 
 
 # for Python ---------------------------------------------------------------------------------

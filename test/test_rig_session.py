@@ -64,6 +64,33 @@ def test_a_rig_needs_two_cameras_and_its_base(names, base):
         rig_session.rig_of_drives(dict.fromkeys(names), base)
 
 
+def test_a_known_height_above_the_road_gives_metres_without_a_speed(placed, monkeypatch):
+    found, drives, kept = placed
+    ride = drives['front'].ride
+    front = rig_session.Learned(None, found.calibrations['front'], kept['front'][1], None, None)
+
+    def in_its_unit(scene, down):
+        """Return what a road with more points than these few tracks would show."""
+        assert down == pytest.approx([0, 1, 0], abs=0.03)
+        seconds = scene.tracks.stamps_ns[scene.structure.registered] / 1e9 - front.start_s
+        length = np.linalg.norm(np.diff(scene.structure.path()[1], axis=0), axis=1).sum()
+        return np.log(1.4 * length / np.ptp(np.interp(seconds, ride.t, ride.s))), 0.001
+
+    monkeypatch.setattr(rig_session, 'log_height', in_its_unit)
+    known = QUICK.replace({'known.height': '1.4±0.028'})
+    metres = rig_session._by_height(front, known, 0.0)
+    assert metres.sigma == pytest.approx(np.hypot(0.02, 0.01), rel=0.01)
+    times = np.arange(0.0, ride.duration - 0.2, 0.05)
+    true, seen = np.gradient(np.interp(times, ride.t, ride.s), times), metres.speed(times)
+    inside = (seen > 0) & (true > 1)
+    assert inside.sum() > 100
+    assert np.median(seen[inside] / true[inside]) == pytest.approx(1.0, abs=0.03)
+    # between the stretches nothing is known; nor where a camera is not aligned, or no height is
+    assert (seen == 0).sum() > 20
+    assert rig_session._by_height(front, known, None) is None
+    assert rig_session._by_height(front, QUICK, 0.0) is None
+
+
 def test_pictures_show_where_a_camera_sits(placed):
     found, drives, _ = placed
     true, rear = true_places(drives, 'front')['rear'], found.rig.cameras['rear']

@@ -238,6 +238,11 @@ SETTINGS: tuple[Argument, ...] = (
     ('--config', {'type': Path, 'metavar': 'YAML', 'help': 'settings from a file'}),
     ('--set', {'action': 'append', 'default': [], 'metavar': 'KEY=VALUE',
                'help': 'one setting, over those of --config; may be repeated'}))
+KNOWN: Argument = ('--known', {
+    'action': 'append', 'default': [], 'metavar': 'NAME=VALUE',
+    'help': 'what you know of the camera: stabiliser=no, shutter=global or 24ms, fx=1160±20, '
+            'hfov=120±5, aspect=1, with a speed height=1.45±0.03 (m above the road); may be '
+            'repeated'})
 QUIET: Argument = ('--quiet', {
     **FLAG, 'help': 'no progress and no summary: only warnings and errors'})
 NO_PROGRESS: Argument = ('--quiet', {**FLAG, 'help': 'no progress'})
@@ -264,9 +269,7 @@ DRIVE: tuple[Argument, ...] = (
     ('--turns', {'type': int, 'metavar': 'N', 'help': 'use N turns'}),
     ('--thorough', {'action': 'store_true', 'default': None,
                     'help': 'use every stretch of the drive beside its turns: a smaller sigma'}),
-    ('--known', {'action': 'append', 'default': [], 'metavar': 'NAME=VALUE',
-                 'help': 'what you know of the camera: stabiliser=no, shutter=global or 24ms, '
-                         'fx=1160±20, hfov=120±5, aspect=1; may be repeated'}),
+    KNOWN,
     ('--mask', {'type': Path, 'metavar': 'PNG',
                 'help': 'a picture of the size of the images; its black pixels are not used'}),
     ('--segmentation', {'metavar': 'MODEL.onnx',
@@ -393,6 +396,9 @@ COMMANDS = {
             ('--match', {'action': 'store_true',
                          'help': 'use what two cameras see at the same time, too; without it that '
                                  'is a witness only'}),
+            ('--known', {**KNOWN[1], 'help': 'what you know of all cameras, as for run; '
+                                             'height=1.45±0.03, of the base, gives metres '
+                                             'without a speed'}),
             *SETTINGS, SEED, out_folder('rig', '; --json prints rig.json'), JSON, QUIET),
         exit_codes='exit codes: 0 every camera is accepted; 3 one is weak or refused; 2 bad input '
                    'or usage'),

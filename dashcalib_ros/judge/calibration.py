@@ -378,7 +378,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Known:
-    """What somebody knew of the camera: fx in px, hfov in degrees, aspect, shutter in s.
+    """What somebody knew: fx in px, hfov in degrees, aspect, shutter in s, height in m.
 
     by_turns, by_turns_sigma: what the turns say without it. used: False where they contradict it.
     fx_sigma_without, fx_sigma: px, before and with it.

@@ -6,6 +6,7 @@ import platform
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from dataclasses import field as default
+from functools import partial
 from importlib import metadata
 from typing import Any
 
@@ -131,7 +132,7 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
     witnesses, known = evidence.sensors.witnesses, tuple[Known, ...]()
     if solution is not None:
         informed = spared('what is known before', lost, with_known, solution, config,
-                          evidence.scale.px)
+                          evidence.scale.px, partial(_height, evidence=evidence, config=config))
         solution, known = informed or (solution, known)
         scenes |= {scene.turn: scene for scene in solution.scenes}
     found = CalibrationData(
@@ -315,6 +316,10 @@ def _warnings(found: CalibrationData, solution: Solution, evidence: Evidence
         f'known.{each.name} is {each.value:.5g}, and the turns say {each.by_turns:.5g} ± '
         f'{each.by_turns_sigma:.2g}: it does not count; correct it, or leave it out')
         for each in found.known if not each.used]
+    if found.config.known.height and 'height' not in {each.name for each in found.known}:
+        warnings.append(Notice(
+            'E-KNOWN-HEIGHT', 'known.height does not count: that needs the speed of the car '
+            '(--motion, mount.speed_kmh) and stretches in which the road is seen'))
     if found.config.known.stabiliser == 'no' and not solution.fixed:
         warnings.append(Notice(
             'E-KNOWN-CONTRADICTED',
@@ -379,6 +384,14 @@ def _mount(solution: Solution, evidence: Evidence, level: str, config: Config) -
         return None
     return mount_of(evidence.straights, evidence.lines, solution, level,
                     _speed(evidence, config))
+
+
+def _height(solution: Solution, evidence: Evidence, config: Config) -> tuple[float, float] | None:
+    """Return the height of the camera above the road and its sigma, m; None: not measured."""
+    mount = _mount(solution, evidence, 'accepted', config)
+    if mount is None or mount.height_m is None:
+        return None
+    return mount.height_m, mount.sigma['height_m'] or 0.0
 
 
 def _speed(evidence: Evidence, config: Config) -> Speed | None:

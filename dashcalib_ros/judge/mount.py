@@ -435,13 +435,11 @@ def _height(scenes: Sequence[Scene], speed: Speed, down: Floats) -> tuple[float,
     return float(np.exp(log)), float(np.exp(log) * np.hypot(sigma, HEIGHT_FLOOR))
 
 
-# times the height to the side of the path: the road between the wheels; images that see a point
-ROADWAY, LEAST_SEEN, LEAST_ROAD_POINTS = 1.0, 3, 8
-
-
 def _height_in_turn(scene: Scene, speed: Speed, down: Floats) -> tuple[float, float] | None:
-    """Return the logarithm of the height of a path above the road under it, and its sigma."""
-    structure = scene.structure
+    """Return the logarithm of the height of a path above the road under it, m, and its sigma."""
+    structure, found = scene.structure, log_height(scene, down)
+    if found is None:
+        return None
     rotations, centres = structure.path()
     stamps_s = scene.tracks.stamps_ns[structure.registered] / 1e9
     # in a bend the camera is faster than what measures the speed
@@ -451,7 +449,22 @@ def _height_in_turn(scene: Scene, speed: Speed, down: Floats) -> tuple[float, fl
     straight = (bend < UNBENT * bend.max()) & (metres > 0)
     if not straight.any():
         return None
-    unit = metres[straight].sum() / ways[straight].sum()
+    return found[0] + float(np.log(metres[straight].sum() / ways[straight].sum())), found[1]
+
+
+# times the height to the side of the path: the road between the wheels; images that see a point
+ROADWAY, LEAST_SEEN, LEAST_ROAD_POINTS = 1.0, 3, 8
+
+
+def log_height(scene: Scene, down: Floats) -> tuple[float, float] | None:
+    """Return the logarithm of the height of a path above the road under it, and its sigma.
+
+    In the scene's unit; None where too little of the road was seen. down: (3,) in the camera's
+    frame.
+    """
+    structure = scene.structure
+    rotations, centres = structure.path()
+    ways = np.linalg.norm(np.diff(centres, axis=0), axis=1)
     ahead = np.gradient(centres, axis=0)
     ahead /= np.linalg.norm(ahead, axis=1)[:, None]
     down = (rotations.transpose(0, 2, 1) @ down).mean(axis=0)
@@ -467,6 +480,6 @@ def _height_in_turn(scene: Scene, speed: Speed, down: Floats) -> tuple[float, fl
     road = (depth > 0) & (aside < ROADWAY * depth) & (np.abs(along) < ways.max())
     if road.sum() < LEAST_ROAD_POINTS:
         return None
-    logs = np.log(depth[road] * unit)
+    logs = np.log(depth[road])
     middle = float(np.median(logs))
     return middle, mad_sigma(logs - middle) / np.sqrt(len(logs))

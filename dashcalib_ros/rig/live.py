@@ -16,7 +16,7 @@ from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.rig.dense import posed
 from dashcalib_ros.rig.paths import CameraPaths, camera_paths, coarse_paths, ordered
 from dashcalib_ros.rig.placed import Alone, RigCalibration, rig_of_paths
-from dashcalib_ros.rig.start import aligned
+from dashcalib_ros.rig.start import Metres, aligned
 from dashcalib_ros.solve import solve
 from dashcalib_ros.solve.solution import Solution
 
@@ -50,7 +50,8 @@ def rig_of_scenes(scenes: Mapping[str, Sequence[Scene]], levels: Mapping[str, Le
              for name, each in found.items()}
     return rig_of_paths(
         alone, base, turned, paths,
-        None if speed is None else lambda seconds: speed.at(seconds + start_s)[:, 0], config.rig)
+        None if speed is None else Metres(lambda seconds: speed.at(seconds + start_s)[:, 0]),
+        config.rig)
 
 
 def _solved(scenes: Sequence[Scene], config: Config) -> Solution | None:

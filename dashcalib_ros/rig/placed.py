@@ -164,8 +164,9 @@ def rig_of_paths(alone: Mapping[str, Alone], base: str, turned: Mapping[str, Ali
                 name, base, turned.get(name), lacking))
         else:
             cameras[name] = placed(
-                name, own.calibration, best, metres is not None, own.start_s - alone[base].start_s,
-                limits, (*doubts[name], *base_doubts(name, base, doubts[base])))
+                name, own.calibration, best, None if metres is None else metres.sigma,
+                own.start_s - alone[base].start_s, limits,
+                (*doubts[name], *base_doubts(name, base, doubts[base])))
     return RigCalibration(base, cameras, seen.epipolar,
                           () if car is None else misnamed(cameras, car))
 
@@ -241,16 +242,18 @@ def why_not_aligned(name: str, base: str, found: Aligned | None, lacking: str | 
                   f'both clips are of one drive and one car')
 
 
-def placed(name: str, calibration: str, solved: Solved, metric: bool, clock: float,
+def placed(name: str, calibration: str, solved: Solved, scale_sigma: float | None, clock: float,
            limits: RigConfig, doubts: Sequence[Notice] = ()) -> PlacedCamera:
     """Return where a camera sits.
 
-    metric: whether metres are known. clock: s by which its stamps begin after the base's. doubts:
-    what keeps it from being accepted, whatever its sigmas.
+    scale_sigma: the share by which all metres may be off; None: no metres are known. clock: s by
+    which its stamps begin after the base's. doubts: what keeps it from being accepted, whatever
+    its sigmas.
     """
-    place, groups = solved.problem.places[name], solved.own[name]
+    place, groups, metric = solved.problem.places[name], solved.own[name], scale_sigma is not None
     sigma = solved.sigma(name)[:7] * np.r_[np.degrees(np.ones(3)), np.ones(4)]
     sigma = np.hypot(sigma, STRETCH / np.sqrt(max(len(groups), 1)))
+    sigma[3:6] = np.hypot(sigma[3:6], (scale_sigma or 0.0) * place.translation_m)
     apart = solved.disagreement(name)[:7] > DISAGREE
     most = np.repeat([limits.rotation_deg, limits.translation_m, limits.clock_s], (3, 3, 1))
     alone = len(groups) < LEAST_STRETCHES or bool(doubts)
@@ -321,7 +324,8 @@ def _reasons(name: str, visible: Visible, stretches: int, apart: Mask, sigma: Fl
                             f'two cameras, turns show the rest'))
     if not metric:
         found.append(Notice('E-RIG-NO-METRES', f'{name}: no metres are known, so it has no '
-                            f'translation: add a speed (--motion)'))
+                            f'translation: add a speed (--motion), or the '
+                            f'height of the base above the road (--known height=1.45±0.03)'))
     if visible.clock == 'not visible':
         found.append(Notice('E-RIG-CLOCK', f'{name}: its clock is known to {sigma[6]:.3f} s only: '
                             f'drive sharper turns'))

@@ -38,8 +38,17 @@ SPEED_SIGMA, BENT_SIGMA = 0.01, 0.02
 # of a path's largest bend, below which it is straight: in a bend a camera is faster than a wheel
 UNBENT = 0.3
 
-# the speed of the car (n,), m/s, at times (n,) on the clock of the base
-Metres = Callable[[Floats], Floats]
+
+@dataclass(frozen=True)
+class Metres:
+    """What tells the metres of a path.
+
+    speed: of the car (n,), m/s, at times (n,) on the clock of the base; 0 where it is not known.
+    sigma: the share by which all of it may be off.
+    """
+
+    speed: Callable[[Floats], Floats]
+    sigma: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -155,7 +164,7 @@ def problem_of(cameras: Mapping[str, CameraPaths], base: str, found: Mapping[str
                metres: Metres | None) -> Problem:
     """Return the problem to start with. found: the cameras that are aligned with the base.
 
-    metres: of the car between two times; None: unknown.
+    metres: None: unknown.
     """
     names = [base, *found]
     middles = {name: float(np.mean([np.mean(scene.seconds) for scene in cameras[name].scenes]))
@@ -169,7 +178,8 @@ def problem_of(cameras: Mapping[str, CameraPaths], base: str, found: Mapping[str
             key = (name, n)
             pairs += [pair for m in range(len(cameras[base].scenes))
                       if (pair := _pair(cameras, places, (base, m), key)) is not None]
-    known = {key: _unit_of(cameras[key[0]].scenes[key[1]], metres)
+    known = {key: _unit_of(cameras[key[0]].scenes[key[1]],
+                          None if metres is None else metres.speed)
              for key in dict.fromkeys(pair.reference for pair in pairs)}
     used = {name for pair in pairs for name in (pair.reference[0], pair.other[0])} | {base}
     return Problem({name: cameras[name] for name in names if name in used}, base,
@@ -201,7 +211,7 @@ def _length(centres: Floats) -> float:
     return float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum())
 
 
-def _unit_of(scene: ScenePath, speed: Metres | None) -> tuple[float, float]:
+def _unit_of(scene: ScenePath, speed: Callable[[Floats], Floats] | None) -> tuple[float, float]:
     """Return the log of the metres in a scene's unit, and its sigma."""
     ways, between = np.linalg.norm(np.diff(scene.centres, axis=0), axis=1), np.diff(scene.seconds)
     if speed is not None:

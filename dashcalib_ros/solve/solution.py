@@ -279,7 +279,9 @@ def with_measurement(solution: Solution, along: Floats, apart: float, variance: 
     own. Only the camera and what is known of it move: the turns stay as they are.
     """
     known = solution.posterior
-    further = Quadratic(np.outer(along, along) / variance, along * apart / variance,
+    # the mean that moves is not at the solution
+    further = Quadratic(np.outer(along, along) / variance,
+                        along * (apart + along @ known.offset) / variance,
                         np.zeros((len(along), len(along))))
     moved = replace(known, further=(*known.further, further))
     step, place = moved.offset - known.offset, len(known.lens.params)

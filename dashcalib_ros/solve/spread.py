@@ -109,17 +109,23 @@ class Posterior:
     @cached_property
     def total(self) -> Quadratic:
         """Return the cost of all turns and the prior, where turns do not differ."""
-        return Quadratic.together([*self.turns, self.prior, *self.further])
+        return Quadratic.together([*self.turns, self.prior])
 
     @cached_property
     def offset(self) -> Floats:
         """Return (m,) how far the mean of these turns is off the optimum of all."""
-        weights, means, _ = self._cases
-        return np.asarray(weights @ means)
+        return self._informed[0]
 
     @cached_property
     def covariance(self) -> Floats:
-        """Return (m, m) the covariance about the optimum of these turns."""
+        """Return (m, m) the covariance about the optimum of these turns.
+
+        What is known besides moves that optimum by as much as it moves their mean.
+        """
+        return self._informed[1]
+
+    @cached_property
+    def _informed(self) -> tuple[Floats, Floats]:
         weights, means, covariances = self._cases
         away = means - self.total.optimum
         spread = np.einsum('c,cij->ij', weights, covariances) + (weights * away.T) @ away
@@ -128,7 +134,10 @@ class Posterior:
         drawn = self.total.covariance[:, 2:4] @ self.prior.score[2:4]
         spread += np.outer(drawn, drawn)
         spread[np.ix_(self.own, self.own)] += self.alike_in_all
-        return np.asarray(spread)
+        found = np.asarray(weights @ means), np.asarray(spread)
+        for cost in self.further:
+            found = informed(*found, cost)
+        return found
 
     def erring_together(self, size: float) -> Posterior:
         """Return it where all turns may be off by the same share of fx, with a sigma of size."""
@@ -187,13 +196,12 @@ class Posterior:
                     gain, group = softened(group, drives)
                     log += gain
                 groups.append(group)
-        total = Quadratic.together([*groups, prior, *self.further])
+        total = Quadratic.together([*groups, prior])
         covariance = total.covariance
         mean = covariance @ total.score
         log += 0.5 * float(total.score @ mean - np.linalg.slogdet(total.hessian)[1])
-        # the sandwich; of priors, and of what sensors say, the covariance is what they say
-        exact = Quadratic.together([prior, *self.further]).hessian
-        noise = sum(group.by_track for group in groups) + exact
+        # the sandwich; of priors the covariance is what they say
+        noise = sum(group.by_track for group in groups) + prior.hessian
         return log, mean, covariance @ noise @ covariance
 
     @cached_property
@@ -210,6 +218,16 @@ class Posterior:
         places = np.eye(len(self.prior.score))[:, self.own]
         return (places[:, :0], DRIVES_DIFFER * self._along_fx,
                 DRIVES_DIFFER * self.lens.fx * places * (by_unit[0] / by_unit))
+
+
+def informed(mean: Floats, covariance: Floats, cost: Quadratic) -> tuple[Floats, Floats]:
+    """Return a mean (m,) and a covariance (m, m), which may hold some parameters, with a cost.
+
+    Of it only hessian and score count: it is as sure as it says.
+    """
+    smaller = np.linalg.solve(np.eye(len(mean)) + covariance @ cost.hessian, covariance)
+    return (np.asarray(mean + smaller @ (cost.score - cost.hessian @ mean)),
+            np.asarray((smaller + smaller.T) / 2))
 
 
 def softened(cost: Quadratic, columns: Floats) -> tuple[float, Quadratic]:

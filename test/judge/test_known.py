@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from solving import CONFIG, scenes_of, solved
-from synthetic import LENS
+from synthetic import LENS, SIZE
 
 from dashcalib_ros.config import Config, KnownConfig
 from dashcalib_ros.errors import ConfigError
+from dashcalib_ros.input.scale import FULL_SIZE
+from dashcalib_ros.judge.conclude import Evidence, conclude
 from dashcalib_ros.judge.known import with_known
 from dashcalib_ros.judge.verdict import judge
 
@@ -65,13 +68,36 @@ def test_one_turn_alone_contradicts_less_and_names_no_readout_so_soon(found):
     assert used_and_named(alone, 9) == used_and_named(found, 5) == (False, True)
 
 
+def above(height_m):
+    """Return what measures a height that is right with the true lens."""
+    return lambda solution: (height_m * LENS.fx / solution.camera.fx, 0.01 * height_m)
+
+
+def test_a_known_height_above_the_road_tells_the_focal_length(found):
+    short = replace(found, written=replace(found.written, camera=found.camera.zoomed(0.97)),
+                    posterior=found.posterior.erring_together(0.05))
+    informed, [piece] = with_known(short, knowing(height='1.5±0.015'), 1.0, above(1.5))
+    assert piece.used and piece.by_turns == pytest.approx(1.5 / 0.97, rel=0.01)
+    assert abs(informed.camera.fx - LENS.fx) < 0.006 * LENS.fx
+    assert informed.sigma[0] / LENS.fx == pytest.approx(np.hypot(0.01, 0.01), abs=0.002)
+    assert piece.fx_sigma < 0.4 * piece.fx_sigma_without
+    [wrong] = with_known(short, knowing(height='2±0.01'), 1.0, above(1.5))[1]
+    assert not wrong.used
+    # which is not measured without a speed
+    assert with_known(short, knowing(height='1.5'), 1.0) == (short, ())
+    [warning] = [each for each in conclude(
+        found, Evidence(SIZE, 300, (), {}, np.zeros((0, 2)), None, FULL_SIZE, {}),
+        knowing(height='1.5')).warnings if each.code == 'E-KNOWN-HEIGHT']
+    assert '--motion' in warning
+
+
 def test_nothing_known_is_nothing_changed(found):
     assert with_known(found, CONFIG, 1.0) == (found, ())
 
 
 @pytest.mark.parametrize(('name', 'text'), [
     ('fx', '1160'), ('fx', 'NaN±1'), ('shutter', '24'), ('shutter', 'rolling'), ('hfov', '120±'),
-    ('stabiliser', 'yes'), ('aspect', '-1')])
+    ('stabiliser', 'yes'), ('aspect', '-1'), ('height', '-1.4'), ('height', '1.4m')])
 def test_what_cannot_be_understood_is_refused(name, text):
     with pytest.raises(ConfigError):
         Config.of({f'known.{name}': text})

@@ -28,19 +28,16 @@ from dashcalib_ros.rig.placed import (
     rig_of_paths,
     why_not_aligned,
 )
-from dashcalib_ros.rig.start import aligned, problem_of
+from dashcalib_ros.rig.start import Metres, aligned, problem_of
 
 CAMERAS = {
     'front': Mounted(step_s=0.25),
     'rear': Mounted((2.0, 177.5, 1.5), (0.3, -0.2, -2.0), 3.35, 0.25, 0.06),
     'left': Mounted((3.0, 75.0, -2.0), (-0.5, 0.1, 1.0), -0.02, 0.25, 0.02)}
+METRES = Metres(lambda seconds: np.full(len(seconds), SPEED))
 
 
-def speed(seconds):
-    return np.full(len(seconds), SPEED)
-
-
-def rig_of(names=('front', 'rear'), metres=speed, **options) -> tuple[Solved, dict]:
+def rig_of(names=('front', 'rear'), metres=METRES, **options) -> tuple[Solved, dict]:
     cameras = {name: CAMERAS[name] for name in names}
     paths, _ = made_paths(cameras, **options)
     found = {name: aligned(paths[name], paths['front']) for name in names[1:]}
@@ -86,22 +83,22 @@ def test_a_rotation_about_the_vertical_is_known_no_better_than_the_lenses():
 def test_a_flat_road_shows_no_height_and_no_metres_without_a_speed():
     best, _ = rig_of(yaws=(85.0, -75.0), lens_sigma=0.3)
     assert best.sigma('rear')[4] > 3 * best.sigma('rear')[[3, 5]].max()
-    found = placed('rear', 'rear/result.json', best, True, 0.0, RigConfig())
+    found = placed('rear', 'rear/result.json', best, 0.0, 0.0, RigConfig())
     assert found.visible.rotation == ('accepted',) * 3 and found.verdict == 'accepted'
     assert found.translation_m is not None and abs(found.translation_m[2] + 2.0) < 0.05
-    strict = placed('rear', '', best, True, 0.0, RigConfig(rotation_deg=1e-3, clock_s=1e-6))
+    strict = placed('rear', '', best, 0.0, 0.0, RigConfig(rotation_deg=1e-3, clock_s=1e-6))
     assert strict.verdict == 'refused' and strict.visible.clock == 'not visible'
     assert {'E-RIG-ROTATION', 'E-RIG-CLOCK'} == {each.code for each in strict.reasons} - {
         each.code for each in found.reasons}
     best, _ = rig_of(yaws=(85.0, -75.0), metres=None)
-    found = placed('rear', 'rear/result.json', best, False, 0.0, RigConfig())
+    found = placed('rear', 'rear/result.json', best, None, 0.0, RigConfig())
     assert found.translation_m is None and found.verdict == 'accepted'
     assert 'E-RIG-NO-METRES' in [reason.code for reason in found.reasons]
 
 
 def test_one_stretch_or_a_refused_lens_is_weak():
     best, _ = rig_of(yaws=(85.0,))
-    found = placed('rear', '', best, True, 0.0, RigConfig())
+    found = placed('rear', '', best, 0.0, 0.0, RigConfig())
     assert found.verdict == 'weak'
     assert 'E-RIG-ONE-STRETCH' in [reason.code for reason in found.reasons]
     best, _ = rig_of(yaws=(85.0, -75.0))
@@ -109,7 +106,7 @@ def test_one_stretch_or_a_refused_lens_is_weak():
     for doubts, code in ((lens_doubts('rear', 'refused'), 'E-RIG-LENS'),
                          (base_doubts('rear', 'front', lens_doubts('front', 'weak')),
                           'E-RIG-BASE')):
-        found = placed('rear', '', best, True, 0.0, RigConfig(), doubts)
+        found = placed('rear', '', best, 0.0, 0.0, RigConfig(), doubts)
         assert found.verdict == 'weak' and found.rotation_deg is not None
         assert [reason.code for reason in found.reasons] == [code]
 
@@ -144,7 +141,7 @@ def test_a_rotation_belongs_to_the_lenses_as_their_own_turns_say(seed):
     cameras = {name: CAMERAS[name] for name in ('front', 'rear')}
     paths, lenses = made_paths(cameras, yaws=(85.0, -75.0), seed=seed)
     best = solved(problem_of(
-        paths, 'front', {'rear': aligned(paths['rear'], paths['front'])}, speed))
+        paths, 'front', {'rear': aligned(paths['rear'], paths['front'])}, METRES))
     # the two parameters that turn the axes, about y and about x
     front, rear = (rotation_matrices(np.radians([[-0.1 * lens[1], -0.1 * lens[0], 0.0]]))[0]
                    for lens in lenses.values())
@@ -160,14 +157,14 @@ def test_lenses_that_paths_contradict_are_named():
     paths, lenses = made_paths({name: CAMERAS[name] for name in ('front', 'rear')},
                                yaws=(85.0, -75.0), lens_sigma=3.0)
     found = {'rear': aligned(paths['rear'], paths['front'])}
-    best = solved(problem_of(paths, 'front', found, speed))
+    best = solved(problem_of(paths, 'front', found, METRES))
     assert not apart_doubts('rear', best) and not apart_doubts('front', best)
     # a lens that its own turns call much better than it is
     own = paths['rear'].lens_covariance
     paths['rear'] = replace(paths['rear'], lens_covariance=own / 10**2)
     paths['front'] = replace(paths['front'], lens_covariance=own / 10**2)
     assert abs(lenses['rear'][2] - lenses['front'][2]) > 0.5
-    best = solved(problem_of(paths, 'front', found, speed))
+    best = solved(problem_of(paths, 'front', found, METRES))
     assert 'E-RIG-LENS-APART' in [each.code for name in ('front', 'rear')
                                   for each in apart_doubts(name, best)]
 
@@ -175,14 +172,14 @@ def test_lenses_that_paths_contradict_are_named():
 def test_a_scene_that_is_broken_spoils_no_other():
     paths, _ = made_paths({name: CAMERAS[name] for name in ('front', 'rear')}, lens_sigma=0.1)
     found = {'rear': aligned(paths['rear'], paths['front'])}
-    sound = solved(problem_of(paths, 'front', found, speed))
+    sound = solved(problem_of(paths, 'front', found, METRES))
     scenes = list(paths['rear'].scenes)
     half = scenes[2].trajectory.rotations.copy()
     half[len(half) // 2:] = rotation_matrices(np.radians([[2.0, 2.0, 0.0]]))[0] @ half[
         len(half) // 2:]
     scenes[2] = replace(scenes[2], trajectory=replace(scenes[2].trajectory, rotations=half))
     paths['rear'] = replace(paths['rear'], scenes=tuple(scenes))
-    best = solved(problem_of(paths, 'front', found, speed))
+    best = solved(problem_of(paths, 'front', found, METRES))
     assert len(best.problem.pairs) == len(sound.problem.pairs) - 1
     # the pace of the clock apart, which the last turn tells
     assert np.all(best.sigma('rear')[:7] < 2 * sound.sigma('rear')[:7])
@@ -198,8 +195,8 @@ def test_a_camera_that_was_moved_between_two_turns_is_not_accepted():
     paths['rear'] = replace(paths['rear'], scenes=(
         paths['rear'].scenes[0], replace(moved, trajectory=trajectory)))
     found = {'rear': aligned(paths['rear'], paths['front'])}
-    best = solved(problem_of(paths, 'front', found, speed))
-    result = placed('rear', '', best, True, 0.0, RigConfig())
+    best = solved(problem_of(paths, 'front', found, METRES))
+    result = placed('rear', '', best, 0.0, 0.0, RigConfig())
     assert result.verdict != 'accepted'
     assert 'E-RIG-DISAGREE' in [reason.code for reason in result.reasons]
 
@@ -219,13 +216,13 @@ def test_a_camera_that_was_moved_within_a_turn_is_named(turn, degrees):
         scenes[n] = replace(scenes[n], trajectory=replace(
             path, rotations=rotations, translations=translations))
     found = {'rear': aligned(paths['rear'], paths['front'])}
-    sound = solved(problem_of(paths, 'front', found, speed))
+    sound = solved(problem_of(paths, 'front', found, METRES))
     assert not jump_doubts('rear', sound)
     paths['rear'] = replace(paths['rear'], scenes=tuple(scenes))
-    best = solved(problem_of(paths, 'front', found, speed))
+    best = solved(problem_of(paths, 'front', found, METRES))
     doubts = jump_doubts('rear', best)
     assert not jump_doubts('front', best)
-    result = placed('rear', '', best, True, 0.0, RigConfig(), doubts)
+    result = placed('rear', '', best, 0.0, 0.0, RigConfig(), doubts)
     if result.verdict == 'accepted':
         # a first turn that is broken is left out: later ones show where the camera sits now
         after = bump @ CAMERAS['rear'].rotation
@@ -281,7 +278,7 @@ def of_paths(paths, levels=None, base='front'):
     alone = {name: Alone(name, (levels or {}).get(name, 'accepted'), 0.0, len(each.scenes))
              for name, each in paths.items()}
     turned = {name: aligned(paths[name], paths[base]) for name in paths if name != base}
-    return rig_of_paths(alone, base, turned, paths, speed, RigConfig())
+    return rig_of_paths(alone, base, turned, paths, METRES, RigConfig())
 
 
 def codes_of(camera):
@@ -353,7 +350,7 @@ def test_matches_are_observations_of_cameras_and_lenses():
     cameras = {name: CAMERAS[name] for name in ('front', 'left')}
     paths, _ = made_paths(cameras, yaws=(85.0, -75.0), lens_sigma=0.3)
     found = {'left': aligned(paths['left'], paths['front'])}
-    problem = problem_of(paths, 'front', found, speed)
+    problem = problem_of(paths, 'front', found, METRES)
     true, plain = CAMERAS['left'].rotation, solved(problem)
     noise, nothing = np.radians(0.02), np.zeros((3, 3))
     sharp = Matched('front', 'left', true, noise**2 * np.eye(3),
@@ -370,7 +367,7 @@ def test_matches_are_observations_of_cameras_and_lenses():
     paths, _ = made_paths(CAMERAS, yaws=(85.0, -75.0), lens_sigma=0.3)
     turned = {name: aligned(paths[name], paths['front']) for name in ('left', 'rear')}
     across = CAMERAS['rear'].rotation @ true.T
-    problem = replace(problem_of(paths, 'front', turned, speed), matched=(replace(
+    problem = replace(problem_of(paths, 'front', turned, METRES), matched=(replace(
         sharp, a='left', b='rear', rotation=across, follow={'left': nothing, 'rear': nothing}),))
     places = solved(problem).problem.places
     off = rotation_vectors((places['rear'].rotation @ places['left'].rotation.T @ across.T)[None])

@@ -34,6 +34,18 @@ def knowing(offsets_px: list[float], earlier: list[bool] | None = None,
                      np.array(earlier or [False] * len(turns)), Quadratic.prior(1e-9 * np.eye(9)))
 
 
+def test_what_is_known_besides_takes_away_what_all_turns_err_by():
+    turns = knowing([0.5, -0.5]).erring_together(0.1)
+    along = np.eye(9)[0]
+    informed = replace(turns, further=(Quadratic(
+        np.outer(along, along), along * 30.0, np.zeros((9, 9))),))
+    assert sigma(turns) > 0.09 * LENS.fx
+    # fx is 30 ± 1 px more, and fy follows as far as the turns know them together
+    assert sigma(informed) == pytest.approx(1.0, rel=0.01)
+    assert informed.offset[:2] == pytest.approx([30.0, 27.0], rel=0.02)
+    assert informed.covariance[1, 1] < 0.01 * turns.covariance[1, 1]
+
+
 def sigma(known: Posterior) -> float:
     return float(np.sqrt(known.covariance[0, 0]))
 
