@@ -36,7 +36,7 @@ def with_known(solution: Solution, config: Config, px: float, height: Height = l
     """
     # pycolmap may start here: the node imports this module, and must not
     from dashcalib_ros.solve.start import scene_with
-    found = []
+    found, by_turns = [], solution
 
     def adjusted(moved: Solution) -> Solution:
         """Return a solution whose scenes are those of its camera."""
@@ -63,7 +63,9 @@ def with_known(solution: Solution, config: Config, px: float, height: Height = l
             solution = with_measurement(solution, along, value - own, sigma**2 + own_sigma**2)
         found.append(Known(name, value, sigma, own, by_turns_sigma, used, px * before,
                            px * float(solution.sigma[0])))
-    return (adjusted(solution) if any(piece.used for piece in found) else solution), tuple(found)
+    if any(piece.used for piece in found):
+        solution = replace(adjusted(solution), by_turns=by_turns)
+    return solution, tuple(found)
 
 
 def value_of(text: str, name: str) -> tuple[float, float]:

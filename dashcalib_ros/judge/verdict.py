@@ -164,8 +164,8 @@ CONFIRMED = 0.71
 
 def gyro_confirms(solution: Solution) -> bool:
     """Return whether a gyro that agrees knows fx as well as the turns do, or better."""
-    pictures = solution.by_pictures
-    return pictures is not None and bool(solution.sigma[0] <= CONFIRMED * pictures.sigma[0])
+    pictures, with_gyro = solution.by_pictures, solution.by_turns or solution
+    return pictures is not None and bool(with_gyro.sigma[0] <= CONFIRMED * pictures.sigma[0])
 
 
 def _number_of_turns(grounds: Grounds) -> Finding:
@@ -250,8 +250,12 @@ def _sigma_decides(solution: Solution) -> bool:
 
 
 def profile_contrast(solution: Solution) -> float:
-    """Return the relative rise of the cost from the result to the lowest of the other probes."""
-    return solution.around.contrast(solution.camera.fx / solution.camera.image_size[0])
+    """Return the relative rise of the cost from the result to the lowest of the other probes.
+
+    What somebody knew moves the camera, and not what the turns say of its focal length.
+    """
+    camera = (solution.by_turns or solution).camera
+    return solution.around.contrast(camera.fx / camera.image_size[0])
 
 
 def _far_from_profile(grounds: Grounds) -> Finding | None:

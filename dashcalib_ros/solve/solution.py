@@ -106,8 +106,8 @@ class Solution:
     the middle of the drive then; parts: of a step, the solutions of the turns before it and of
     those later. unsettled: how far the last step moved the rays over the picture, in their sigma.
     field_sigma: px, of the prior of the field's directions. by_pictures: the solution of the
-    pictures alone, where a gyro's angles are in this one. px: of the input's pictures, in one
-    pixel of the scenes.
+    pictures alone, where a gyro's angles are in this one; by_turns: without what somebody knew of
+    the camera, where that is in this one. px: of the input's pictures, in one pixel of the scenes.
     """
 
     written: Written
@@ -130,6 +130,7 @@ class Solution:
     unsettled: float = 0.0
     field_sigma: float = 0.0
     by_pictures: Solution | None = None
+    by_turns: Solution | None = None
     px: float = 1.0
 
     @property

@@ -14,7 +14,7 @@ from dashcalib_ros.errors import ConfigError
 from dashcalib_ros.input.scale import FULL_SIZE
 from dashcalib_ros.judge.conclude import Evidence, conclude
 from dashcalib_ros.judge.known import with_known
-from dashcalib_ros.judge.verdict import judge
+from dashcalib_ros.judge.verdict import judge, profile_contrast
 
 
 def knowing(**pieces):
@@ -81,6 +81,9 @@ def test_a_known_height_above_the_road_tells_the_focal_length(found):
     assert abs(informed.camera.fx - LENS.fx) < 0.006 * LENS.fx
     assert informed.sigma[0] / LENS.fx == pytest.approx(np.hypot(0.01, 0.01), abs=0.002)
     assert piece.fx_sigma < 0.4 * piece.fx_sigma_without
+    # what the turns say of it stays what they said
+    assert informed.by_turns is short
+    assert profile_contrast(informed) == profile_contrast(short)
     [wrong] = with_known(short, knowing(height='2±0.01'), 1.0, above(1.5))[1]
     assert not wrong.used
     # which is not measured without a speed
