@@ -258,7 +258,8 @@ def without_turns(known: str) -> Source:
 
 RIG = (found(r'Rendered: (\d+) cameras, (\d+) placed, (\d+) accepted; the worst ([\d.]+) sigmas '
              r'off; sigma about the worst axis ([\d.]+)°'),
-       *(found(rf'halves of {name} .*\| ([\d.]+) \| \| \|') for name in ('kitti07', 'kitti_raw')))
+       *(found(rf'halves of {name} \|(?:[^|]*\|){{6}} ([\d.]+) \|')
+         for name in ('kitti07', 'kitti_raw')))
 
 
 FIGURES = (
