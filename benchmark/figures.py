@@ -250,10 +250,13 @@ EXACT = (found(r'\| 0 \| global shutter \|[^|]*\| ([\d.]+); ([\d.]+)'),)
 CLOCKS = (found(r'or not found: (\d+) of (\d+)'),)
 
 
-def without_turns(known: str) -> Source:
-    """Return a source: pieces of real drives, those with a number, how far these are off."""
-    return found(rf'Real pieces, stabiliser {known}: (\d+) drives, (\d+) numbers, .*?; ([\d.]+) '
+def without_turns(known: str, drives: str = 'Real pieces') -> Source:
+    """Return a source: these drives, those with a number, how far these are off."""
+    return found(rf'{drives}, stabiliser {known}: (\d+) drives, (\d+) numbers, .*?; ([\d.]+) '
                  r'sigmas RMS, (\d+) beyond 2, \d+ beyond 3; sigma ([\d.]+) %')
+
+
+HEIGHT = 'not known; speed and height are'
 
 
 RIG = (found(r'Rendered: (\d+) cameras, (\d+) placed, (\d+) accepted; the worst ([\d.]+) sigmas '
@@ -276,7 +279,9 @@ FIGURES = (
     Figure(README, '| # drives, # accepted, # of them with a parameter more than 3.5 sigma off '
            '| @ |', 'spoilt_tracks', (spoilt,)),
     Figure(README, '| # pieces, # with an fx; # sigmas RMS off, # beyond 2; sigma # % in the '
-           'median | @ |', 'without_turns', (without_turns('no'),)),
+           'median. Its height and the speed known instead: # pieces, # with an fx; # sigmas RMS '
+           'off, # beyond 2; sigma # % | @ |', 'without_turns', (
+               without_turns('no'), without_turns(HEIGHT))),
     Figure(README, '| # of # shifts not within 2 sigma | @ |', 'clocks', CLOCKS),
     Figure(README, '| # cameras, # placed, # accepted after three turns; the worst # sigmas off; '
            'sigma #° in the median. Halves of real pictures, weak: # and # sigmas off | @ |',
@@ -287,6 +292,11 @@ FIGURES = (
            'without_turns', (without_turns('no'),)),
     Figure(PROOF, '| # pieces, # with an fx, at best weak: # sigmas RMS off, # beyond 2; sigma # '
            '% | @ |', 'without_turns', (without_turns('not known'),)),
+    *(Figure(PROOF, f'| # {drives}, # with an fx by their height: # sigmas RMS off, # beyond 2; '
+             'sigma # % | @ |', 'without_turns', (without_turns(HEIGHT, of),))
+      for drives, of in (('pieces', 'Real pieces'), ('spoilt ones', 'Spoilt'))),
+    Figure(PROOF, '| # spoilt ones, # with an fx: # sigmas RMS off, # beyond 2; sigma # % | @ |',
+           'without_turns', (without_turns('not known', 'Spoilt'),)),
     Figure(PROOF, '| # of # accepted: # and # px, # and # sigmas off | @ |', 'without_turns', (
         found(r'Fleets, stabiliser no: (?P<b>\d+) drives, \d+ numbers, (?P<a>\d+) accepted'),
         found(r'(?s)\| kitti03 \| fleet .*?\| (\d+\.\d ± \d+\.\d) \|.*?'

@@ -9,7 +9,7 @@ from shlex import quote
 import numpy as np
 
 from dashcalib_ros.judge import CalibrationData, TurnSummary, Verdict
-from dashcalib_ros.judge.calibration import Condition, Mount, Witnesses
+from dashcalib_ros.judge.calibration import Condition, Known, Mount, Witnesses
 
 ADVICE = {
     'accepted': 'Good to use.',
@@ -129,6 +129,20 @@ def witness_texts(witnesses: Witnesses) -> list[str]:
     return lines
 
 
+# of what somebody knew: its unit, and how many of them are one of the result's
+UNITS = {'fx': (' px', 1.0), 'hfov': ('°', 1.0), 'shutter': (' ms', 1e3), 'height': (' m', 1.0)}
+
+
+def known_text(piece: Known) -> str:
+    """Return what somebody knew of the camera, what the turns say, and what it contributed."""
+    unit, times = UNITS.get(piece.name, ('', 1.0))
+    known, turns = (f'{times * value:.5g} ± {times * sigma:.2g}{unit}' for value, sigma in (
+        (piece.value, piece.sigma), (piece.by_turns, piece.by_turns_sigma)))
+    return (f'{piece.name} {known}, the turns say {turns}: ' + (
+        f'fx is known to {piece.fx_sigma:.2g} px instead of {piece.fx_sigma_without:.2g}'
+        if piece.used else 'it does not count'))
+
+
 def since_start(turn: TurnSummary, calibration: CalibrationData) -> str:
     """Return when a turn was, in s since the start of the drive, as on the plot's axis."""
     return f'{turn.stamp_s - calibration.start_s:.1f}'
@@ -233,6 +247,7 @@ def run_facts(c: CalibrationData) -> list[tuple[str, str]]:
                                   f'which moves with the car (bonnet, pillar, burnt-in text)'))
     if c.mount is not None:
         facts.append(('mounting', mount_text(c.mount)))
+    facts += [('known before', known_text(piece)) for piece in c.known]
     facts += [('motion sensor', text) for text in witness_texts(c.witnesses)]
     times = ', '.join(f'{name} {seconds:.1f} s' for name, seconds in c.timing.items())
     return [*facts, ('time', times)] if times else facts

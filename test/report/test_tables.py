@@ -16,7 +16,7 @@ from dashcalib_ros.camera import Fisheye, Radial
 from dashcalib_ros.camera.field import Field
 from dashcalib_ros.errors import DashcalibError, Notice
 from dashcalib_ros.judge import Verdict
-from dashcalib_ros.judge.calibration import LensField, Shutter, Stabiliser
+from dashcalib_ros.judge.calibration import Known, LensField, Shutter, Stabiliser
 from dashcalib_ros.report import NamedCamera, compare, report_html
 from dashcalib_ros.report.tables import against_truth, comparison, conclusion, next_step, summary
 from dashcalib_ros.report.wording import next_steps
@@ -93,6 +93,17 @@ def test_a_refusal_is_its_cause_and_one_step():
 def test_a_reason_has_its_code():
     verdict = Verdict('weak', (Notice('E-FEW-TURNS', 'few', 'drive'), Notice('', 'no code')))
     assert terminal(conclusion(verdict)).splitlines()[1:] == ['  few [E-FEW-TURNS]', '  no code']
+
+
+def test_terminal_and_page_say_what_knowledge_contributed():
+    height = Known('height', 1.65, 0.02, 1.897, 0.085, True, 33.4, 12.9)
+    shutter = Known('shutter', 0.03, 1e-5, 0.004, 0.002, False, 12.9, 12.9)
+    calibration = make_calibration(known=(height, shutter))
+    for text in (' '.join(terminal(summary(calibration)).split()),
+                 ' '.join(Page(report_html(calibration)).text.split())):
+        assert ('height 1.65 ± 0.02 m, the turns say 1.897 ± 0.085 m: fx is known to 13 px '
+                'instead of 33') in text
+        assert 'shutter 30 ± 0.01 ms, the turns say 4 ± 2 ms: it does not count' in text
 
 
 def test_terminal_and_page_describe_a_mounting_alike():
