@@ -381,6 +381,8 @@ FIGURES = (
            'attacks', (stabilised,)),
     Figure(LIMITS, 'a sigma of fx of # px on a piece of KITTI 03 (@)', 'without_turns', (
         found(r'\| kitti03 \| 10 \| 10 s \| not known \|.*? ± ([\d.]+) \|'),)),
+    Figure(LIMITS, "the camera's height above the road it is # px", 'without_turns', (
+        found(rf'\| kitti03 \| 10 \| 10 s \| {HEIGHT} \|.*? ± ([\d.]+) \|'),)),
     Figure(LIMITS, 'fy was # sigma off, and the result was accepted (@)', 'joined', (
         found(r'\| rolling shutter 20 ms \| inside turns \| 0.2, not told \|(?:[^|]*\|){4} '
               r'([\d.]+)'),)),
