@@ -7,9 +7,9 @@
 Rendered rigs have exact truth. The halves of a recorded drive's pictures are two cameras that look
 to the left and to the right, without distortion; their rotation is known, but for what the lens
 is off with which they were cut, and nothing is between them; their metres are by the height of
-the camera. Of the real pair kitti_stereo the epipolar geometry of matches
-that nothing was fitted to is the witness. The CPU time of each rig is beside that of calibrating
-its cameras alone. Rows go to rig.json in --out; what is there is not run again.
+the camera. Of the real pair kitti_stereo the epipolar geometry of matches that nothing was fitted
+to is the witness. The CPU time of each rig is beside that of calibrating its cameras alone. Rows
+go to rig.json in --out; what is there is not run again.
 """
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from typing import Any
 import cv2
 import numpy as np
 from measure import commit, keep_table, load, parser_with, save
+from mount import NOMINAL_M
 from views import View, Viewed
 
 from dashcalib_ros import open_frames
@@ -62,7 +63,7 @@ HALVES = {
     'kitti_raw': Halved('images', 9.7, Lens(
         1392, 512, 984.24, 980.81, 690.0, 233.2, -0.37288, 0.20373, 0.00222, 0.00138, -0.07234),
                         Lens(720, 400, 900.0, 900.0, 359.5, 199.5), 13.0)}
-PAIR, KITTI_M = 'kitti_stereo', 1.65
+PAIR = 'kitti_stereo'
 # degrees about x and z, of the left half and of the right one
 TILTS_DEG = ((0.4, 0.3), (-0.5, -0.6))
 
@@ -146,7 +147,7 @@ def halves(name: str, data: Path, cache: Path) -> list[str]:
         frames = open_frames(data / name / drive.pictures, fps=drive.fps)
         folders[side] = cut(Viewed(view, frames, drive.own), cache / f'halves-{name}' / side)
     found, cost = measured(folders, fps=drive.fps or 10.0,
-                           config={'known.height': f'{KITTI_M}±0.02'})
+                           config={'known.height': f'{NOMINAL_M}±0.02'})
     rows = []
     for side, camera in found.cameras.items():
         if side != found.base:

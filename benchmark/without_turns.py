@@ -33,7 +33,8 @@ from attacks import Film, shifted, stepped, swings, warped, with_pictures, zoome
 from mapping import GRID
 from measure import calibrate as calibrate_frames
 from measure import commit, isolated, keep_table, load, parser_with, save, table
-from mount import speed_of
+from motion import columns_of
+from mount import NOMINAL_M, speed_of
 from population import closest_cameras, rays_of
 from population import drive_of as camera_and_street
 
@@ -47,8 +48,8 @@ from dashcalib_ros.judge import CalibrationData
 
 # what is known of the camera, as the table says it; 'height' is m above the road
 KNOWN = {'not known': '', 'no': 'no', 'not known; speed and height are': 'height'}
-# m, of KITTI's cars (nominal); what a tape measure is worth
-KITTI_M, TAPE_M = 1.65, 0.02
+# m, what a tape measure is worth
+TAPE_M = 0.02
 # input, images per second of folders, and the truth of fx with its sigma, px
 DRIVES = {'kitti03': ('bag', None, 718.2, 1.8), 'kitti07': ('images', 9.65, 701.9, 1.4),
           'kitti_raw': ('images', 9.7, 981.5, 3.0), 'carnd': ('drive.mp4', None, 1161.0, 10.0)}
@@ -138,11 +139,9 @@ def speed_from(folder: Path, place: str, fps: float | None, start_s: float) -> S
     stamps = np.array([frame.stamp_ns / 1e9 for frame in open_frames(folder / place, fps=fps)])
     first = stamps[stamps >= stamps[0] + start_s - 1e-6][0] - stamps[0]
     if (folder / 'oxts.csv').exists():
-        with open(folder / 'oxts.csv', encoding='utf-8', newline='') as stream:
-            rows = np.array([[float(row[name]) for name in ('stamp_s', 'vf', 'vl')]
-                             for row in csv.DictReader(stream)])
-        return SensorStream(speed=Samples(rows[:, 0] - first,
-                                          np.hypot(rows[:, 1], rows[:, 2])[:, None]))
+        own = columns_of(folder / 'oxts.csv')
+        return SensorStream(speed=Samples(own['stamp_s'] - first,
+                                          np.hypot(own['vf'], own['vl'])[:, None]))
     positions = read_poses(folder / 'poses.txt').positions
     count = min(len(positions), len(stamps))
     return speed_of(stamps[:count] - stamps[0] - first, positions[:count])
@@ -153,7 +152,7 @@ def piece(data: Path, name: str, start_s: float, seconds: float, known: str) -> 
     place, fps, fx, fx_sigma = DRIVES[name]
     motion = speed_from(data / name, place, fps, start_s) if known == 'height' else None
     found = calibrate(data / name / place, fps=fps, start_s=start_s, duration_s=seconds,
-                      motion=motion, config=knowing(known, KITTI_M))
+                      motion=motion, config=knowing(known, NOMINAL_M))
     return row_of(found, fx, fx_sigma)
 
 

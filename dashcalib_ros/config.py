@@ -130,7 +130,7 @@ class KnownConfig:
     aspect: str = setting(
         '', 'fy / fx: 1, 1±0.001', pattern=rf'({NUMBER}(±{NUMBER})?)?')
     height: str = setting(
-        '', 'm above the road: 1.45±0.03; with a speed it tells fx, to a rig the metres',
+        '', 'm above the road: 1.45±0.03; determines fx with a speed, and the metres of a rig',
         pattern=rf'({NUMBER}(±{NUMBER})?)?')
 
 

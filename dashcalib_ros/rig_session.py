@@ -68,7 +68,7 @@ from dashcalib_ros.workers.worker import Progress
 GRID_S = 0.1
 # pairs of images in which two cameras are matched, and s that these may be apart
 PICTURES, TOGETHER_S = 12, 0.012
-# s; beside a stretch of which a speed is known, it is not
+# s: so long before and after a stretch, the speed counts as unknown
 NEXT_S = 1e-3
 # sigmas of a rotation, and degrees, that the epipolar geometry of matches may be off
 CONTRADICTED, LEAST_APART_DEG = 3.0, 0.15
@@ -123,10 +123,9 @@ def rig_of_drives(drives: Mapping[str, Recording], base: str | None = None,
     if base not in (None, *drives) or len(drives) < 2:
         raise InputError('E-RIG-CAMERAS', f'a rig needs two cameras, and its base, {base}, is one '
                          f'of them: name them as front=front.mp4 left=left.mp4')
-    measured = base or next(iter(drives))
-    learned = {name: _learn(name, drive, config if name == measured and drive.motion else replace(
-        config, known=replace(config.known, height='')), observer)
-               for name, drive in drives.items()}
+    measured, others = base or next(iter(drives)), config.replace({'known.height': ''})
+    learned = {name: _learn(name, drive, config if name == measured and drive.motion else others,
+                            observer) for name, drive in drives.items()}
     found = {name: coarse_paths(name, each.solution, each.start_s)
              for name, each in learned.items()}
     base = base or best_base({name: each.calibration.verdict.level
@@ -344,7 +343,7 @@ def _by_speed(learned: Mapping[str, Learned], late: Mapping[str, float]) -> Metr
         each = learned[name]
         speed = each.drive.motion and speeds_of(each.drive.motion.since(each.start_s))
         if speed:
-            return _at(speed, offset, 0.0)
+            return Metres.by(speed, offset)
     return None
 
 
@@ -370,12 +369,8 @@ def _by_height(camera: Learned, config: Config, late: float | None) -> Metres | 
             speeds += [np.zeros(1), speed[:1], speed, speed[-1:], np.zeros(1)]
     if not times:
         return None
-    return _at(Samples(np.concatenate(times), np.concatenate(speeds)[:, None]), late,
-               float(np.hypot(sigma / height, HEIGHT_FLOOR)))
-
-
-def _at(speed: Samples, offset: float, sigma: float) -> Metres:
-    return Metres(lambda seconds: speed.at(seconds + offset)[:, 0], sigma)
+    return Metres.by(Samples(np.concatenate(times), np.concatenate(speeds)[:, None]), late,
+                     float(np.hypot(sigma / height, HEIGHT_FLOOR)))
 
 
 # for Python ---------------------------------------------------------------------------------

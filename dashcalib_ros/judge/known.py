@@ -31,8 +31,8 @@ def with_known(solution: Solution, config: Config, px: float, height: Height = l
                ) -> tuple[Solution, tuple[Known, ...]]:
     """Return the solution with what is known, and what each piece of it contributed.
 
-    px: of the input's pictures, in one pixel of the solution. A known height that the drive does
-    not show is none of the pieces.
+    px: of the input's pictures, in one pixel of the solution. A known height is left out where the
+    drive does not show the height.
     """
     # pycolmap may start here: the node imports this module, and must not
     from dashcalib_ros.solve.start import scene_with
@@ -98,8 +98,9 @@ def _by_road(solution: Solution, known_m: float, height: Height,
              adjusted: Callable[[Solution], Solution]) -> tuple[float, Floats, float] | None:
     """Return the height that the drive shows, m, how it follows what turns share, its own sigma.
 
-    None where it shows none. A longer lens sees the same road from lower above it. fx is changed
-    by as much as the known height asks, and the other parameters as they follow it.
+    None where it shows none. With a longer focal length the same pictures show the road closer
+    below the camera. fx is changed by as much as the known height asks for, and the other
+    parameters follow it as the turns let them.
     """
     seen = height(solution)
     if seen is None:

@@ -252,7 +252,7 @@ def _sigma_decides(solution: Solution) -> bool:
 def profile_contrast(solution: Solution) -> float:
     """Return the relative rise of the cost from the result to the lowest of the other probes.
 
-    What somebody knew moves the camera, and not what the turns say of its focal length.
+    The result is the camera that the turns give, before what somebody knew moved it.
     """
     camera = (solution.by_turns or solution).camera
     return solution.around.contrast(camera.fx / camera.image_size[0])

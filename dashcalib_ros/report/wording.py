@@ -129,7 +129,7 @@ def witness_texts(witnesses: Witnesses) -> list[str]:
     return lines
 
 
-# of what somebody knew: its unit, and how many of them are one of the result's
+# of each piece of knowledge: the unit that is shown, and the factor to it from result.json's
 UNITS = {'fx': (' px', 1.0), 'hfov': ('°', 1.0), 'shutter': (' ms', 1e3), 'height': (' m', 1.0)}
 
 

@@ -50,8 +50,7 @@ def rig_of_scenes(scenes: Mapping[str, Sequence[Scene]], levels: Mapping[str, Le
              for name, each in found.items()}
     return rig_of_paths(
         alone, base, turned, paths,
-        None if speed is None else Metres(lambda seconds: speed.at(seconds + start_s)[:, 0]),
-        config.rig)
+        None if speed is None else Metres.by(speed, start_s), config.rig)
 
 
 def _solved(scenes: Sequence[Scene], config: Config) -> Solution | None:

@@ -14,6 +14,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera.rotation import centres_of, nearest_rotation
+from dashcalib_ros.input.motion import Samples
 from dashcalib_ros.rig.joint import UNKNOWN_UNIT, Gauge, Pair, Place, Problem, SceneKey
 from dashcalib_ros.rig.paths import CameraPaths, ScenePath
 
@@ -41,7 +42,7 @@ UNBENT = 0.3
 
 @dataclass(frozen=True)
 class Metres:
-    """What tells the metres of a path.
+    """What gives a path its metres.
 
     speed: of the car (n,), m/s, at times (n,) on the clock of the base; 0 where it is not known.
     sigma: the share by which all of it may be off.
@@ -49,6 +50,11 @@ class Metres:
 
     speed: Callable[[Floats], Floats]
     sigma: float = 0.0
+
+    @classmethod
+    def by(cls, speed: Samples, late_s: float, sigma: float = 0.0) -> Metres:
+        """Return the metres by a measured speed. late_s: of its clock against the base's."""
+        return cls(lambda seconds: speed.at(seconds + late_s)[:, 0], sigma)
 
 
 @dataclass(frozen=True)
@@ -178,8 +184,7 @@ def problem_of(cameras: Mapping[str, CameraPaths], base: str, found: Mapping[str
             key = (name, n)
             pairs += [pair for m in range(len(cameras[base].scenes))
                       if (pair := _pair(cameras, places, (base, m), key)) is not None]
-    known = {key: _unit_of(cameras[key[0]].scenes[key[1]],
-                          None if metres is None else metres.speed)
+    known = {key: _unit_of(cameras[key[0]].scenes[key[1]], metres)
              for key in dict.fromkeys(pair.reference for pair in pairs)}
     used = {name for pair in pairs for name in (pair.reference[0], pair.other[0])} | {base}
     return Problem({name: cameras[name] for name in names if name in used}, base,
@@ -211,11 +216,11 @@ def _length(centres: Floats) -> float:
     return float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum())
 
 
-def _unit_of(scene: ScenePath, speed: Callable[[Floats], Floats] | None) -> tuple[float, float]:
+def _unit_of(scene: ScenePath, known: Metres | None) -> tuple[float, float]:
     """Return the log of the metres in a scene's unit, and its sigma."""
     ways, between = np.linalg.norm(np.diff(scene.centres, axis=0), axis=1), np.diff(scene.seconds)
-    if speed is not None:
-        metres = speed(scene.seconds[:-1] + between / 2) * between
+    if known is not None:
+        metres = known.speed(scene.seconds[:-1] + between / 2) * between
         bend = np.linalg.norm(scene.steps(scene.seconds)[0], axis=1) / np.maximum(ways, 1e-12)
         kept = (bend < UNBENT * bend.max()) & (metres > 0)
         sigma = SPEED_SIGMA if kept.sum() >= LEAST_SHARED else BENT_SIGMA

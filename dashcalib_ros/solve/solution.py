@@ -106,8 +106,8 @@ class Solution:
     the middle of the drive then; parts: of a step, the solutions of the turns before it and of
     those later. unsettled: how far the last step moved the rays over the picture, in their sigma.
     field_sigma: px, of the prior of the field's directions. by_pictures: the solution of the
-    pictures alone, where a gyro's angles are in this one; by_turns: without what somebody knew of
-    the camera, where that is in this one. px: of the input's pictures, in one pixel of the scenes.
+    pictures alone, where a gyro's angles are in this one; by_turns: the one before what somebody
+    knew of the camera was used. px: of the input's pictures, in one pixel of the scenes.
     """
 
     written: Written
@@ -280,7 +280,7 @@ def with_measurement(solution: Solution, along: Floats, apart: float, variance: 
     own. Only the camera and what is known of it move: the turns stay as they are.
     """
     known = solution.posterior
-    # the mean that moves is not at the solution
+    # scores are about the optimum, and the solution stands for the mean, which is off it
     further = Quadratic(np.outer(along, along) / variance,
                         along * (apart + along @ known.offset) / variance,
                         np.zeros((len(along), len(along))))

@@ -221,9 +221,10 @@ class Posterior:
 
 
 def informed(mean: Floats, covariance: Floats, cost: Quadratic) -> tuple[Floats, Floats]:
-    """Return a mean (m,) and a covariance (m, m), which may hold some parameters, with a cost.
+    """Return a mean (m,) and a covariance (m, m), updated by a cost as in a Kalman filter.
 
-    Of it only hessian and score count: it is as sure as it says.
+    The covariance may be singular, as where a parameter is held. The cost's hessian is taken for
+    its information; its by_track does not count.
     """
     smaller = np.linalg.solve(np.eye(len(mean)) + covariance @ cost.hessian, covariance)
     return (np.asarray(mean + smaller @ (cost.score - cost.hessian @ mean)),
