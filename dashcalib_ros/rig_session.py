@@ -21,7 +21,7 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.errors import InputError, Notice
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.inputs import Paths
-from dashcalib_ros.input.motion import Samples, speeds_of
+from dashcalib_ros.input.motion import Samples, speed_sigma, speeds_of
 from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge.known import value_of
 from dashcalib_ros.judge.mount import HEIGHT_FLOOR, log_height
@@ -341,9 +341,10 @@ def _by_speed(learned: Mapping[str, Learned], late: Mapping[str, float]) -> Metr
     """
     for name, offset in late.items():
         each = learned[name]
-        speed = each.drive.motion and speeds_of(each.drive.motion.since(each.start_s))
-        if speed:
-            return Metres.by(speed, offset)
+        motion = each.drive.motion
+        speed = motion and speeds_of(motion.since(each.start_s))
+        if motion and speed:
+            return Metres.by(speed, offset, speed_sigma(motion))
     return None
 
 

@@ -357,6 +357,15 @@ def speeds_of(stream: SensorStream) -> Samples | None:
     return Samples((stamps_s + passed / 2)[known], (way[known] / passed[known])[:, None])
 
 
+# of all speeds, a fraction: wheels wear and expand; positions of a receiver
+WHEELS_SIGMA, POSITIONS_SIGMA = 0.02, 0.01
+
+
+def speed_sigma(stream: SensorStream) -> float:
+    """Return the sigma of the scale of speeds_of, a fraction."""
+    return POSITIONS_SIGMA if stream.speed is None else WHEELS_SIGMA
+
+
 def temperature_of(streams: Iterable[SensorStream | None], start_s: float) -> Samples | None:
     """Return the temperature of the first stream that has one, on the images' clock, else None."""
     for stream in streams:

@@ -21,7 +21,7 @@ from dashcalib_ros.detect.one_camera import OtherCamera
 from dashcalib_ros.detect.straights import Straights
 from dashcalib_ros.detect.turn import Turn, TurnId, is_turn
 from dashcalib_ros.errors import Notice, counted, spared
-from dashcalib_ros.input.motion import Samples, SensorStream, speeds_of
+from dashcalib_ros.input.motion import Samples, SensorStream, speed_sigma, speeds_of
 from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge.agreement import CONTRADICTS, STOOD, focal_disagreement
 from dashcalib_ros.judge.calibration import (
@@ -394,17 +394,22 @@ def _height(solution: Solution, evidence: Evidence, config: Config) -> tuple[flo
     return mount.height_m, mount.sigma['height_m'] or 0.0
 
 
+# of a speed that a driver reads and keeps, a fraction
+CONSTANT_SIGMA = 0.03
+
+
 def _speed(evidence: Evidence, config: Config) -> Speed | None:
     constant = config.mount.speed_kmh / 3.6
     if constant:
-        return lambda stamps_s: np.full(len(stamps_s), constant)
+        return Speed(lambda stamps_s: np.full(len(stamps_s), constant), CONSTANT_SIGMA)
     if evidence.motion is None:
         return None
     known = speeds_of(evidence.motion.since(evidence.start_s))
     if known is None:
         return None
-    return lambda stamps_s: np.interp(stamps_s - evidence.start_s, known.stamps_s,
-                                      known.values[:, 0], left=0.0, right=0.0)
+    return Speed(lambda stamps_s: np.interp(stamps_s - evidence.start_s, known.stamps_s,
+                                            known.values[:, 0], left=0.0, right=0.0),
+                 speed_sigma(evidence.motion))
 
 
 def _of_size(mask: Mask | None, size: tuple[int, int]) -> Mask | None:

@@ -36,7 +36,14 @@ from dashcalib_ros.robust import (
 )
 from dashcalib_ros.solve.solution import Solution
 
-Speed = Callable[[Floats], Floats]
+
+@dataclass(frozen=True)
+class Speed:
+    """at: m/s (n,) at stamps (n,), s. sigma: what it may be off by all along, a fraction."""
+
+    at: Callable[[Floats], Floats]
+    sigma: float
+
 
 
 @dataclass(frozen=True)
@@ -69,15 +76,16 @@ def mount_of(straights: Straights, lines: Lines | None, solution: Solution, leve
     """Return how the camera sits on the car; None where that is not known.
 
     straights, lines: in the scenes' pixels. level: the lens's verdict; the mount's is never
-    better. speed: m/s (n,) at stamps (n,), s.
+    better.
     """
     camera = solution.camera
     pairs = _poses_of_pairs(camera, _without_field(straights, solution))
     kept = _straight_pairs(pairs)
     # where the speed is not known, a second is the unit
-    driven = speed or (lambda stamps_s: np.ones(len(stamps_s)))
+    driven = speed or Speed(lambda stamps_s: np.ones(len(stamps_s)), 0.0)
     before_s, apart_s = straights.stamps_s - straights.apart_s, straights.apart_s
-    kept &= np.abs(driven(straights.stamps_s) - driven(before_s)) < MAX_ACCELERATION_M_S2 * apart_s
+    faster = driven.at(straights.stamps_s) - driven.at(before_s)
+    kept &= np.abs(faster) < MAX_ACCELERATION_M_S2 * apart_s
     roll = _roll(solution.scenes, lines, camera)
     scenes: Sequence[Scene] = solution.scenes
     change = _moved(pairs, kept, straights.stamps_s)
@@ -99,7 +107,7 @@ def mount_of(straights: Straights, lines: Lines | None, solution: Solution, leve
     own = np.degrees(solution.sigma[2:4] / solution.camera.params[:2])
     total = np.hypot(sigma, own)
     height = _height(scenes, driven, _direction(np.array([angles[0], angles[1] + 90.0]), turned))
-    metres = float((apart_s * driven(before_s + apart_s / 2))[kept].sum() / 2)
+    metres = float((apart_s * driven.at(before_s + apart_s / 2))[kept].sum() / 2)
     if speed is None:
         metres *= USUAL_SPEED if height is None else USUAL_HEIGHT_M / height[0]
         height = None
@@ -432,7 +440,7 @@ def _height(scenes: Sequence[Scene], speed: Speed, down: Floats) -> tuple[float,
         return None
     logs, sigmas = np.array(found).T
     log, sigma = _averaged(logs, sigmas, TURN_SCATTER)
-    return float(np.exp(log)), float(np.exp(log) * np.hypot(sigma, HEIGHT_FLOOR))
+    return float(np.exp(log)), float(np.exp(log) * math.hypot(sigma, HEIGHT_FLOOR, speed.sigma))
 
 
 def _height_in_turn(scene: Scene, speed: Speed, down: Floats) -> tuple[float, float] | None:
@@ -444,7 +452,7 @@ def _height_in_turn(scene: Scene, speed: Speed, down: Floats) -> tuple[float, fl
     stamps_s = scene.tracks.stamps_ns[structure.registered] / 1e9
     # in a bend the camera is faster than what measures the speed
     bend, ways = _bend(rotations, centres), np.linalg.norm(np.diff(centres, axis=0), axis=1)
-    metres = speed((stamps_s[1:] + stamps_s[:-1]) / 2) * np.diff(stamps_s)
+    metres = speed.at((stamps_s[1:] + stamps_s[:-1]) / 2) * np.diff(stamps_s)
     # before and after the sensor's samples the speed is 0
     straight = (bend < UNBENT * bend.max()) & (metres > 0)
     if not straight.any():

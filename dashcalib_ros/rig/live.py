@@ -10,7 +10,7 @@ from dataclasses import replace
 
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import TurnId
-from dashcalib_ros.input.motion import Samples
+from dashcalib_ros.input.motion import WHEELS_SIGMA, Samples
 from dashcalib_ros.judge.calibration import Level
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.rig.dense import posed
@@ -50,7 +50,7 @@ def rig_of_scenes(scenes: Mapping[str, Sequence[Scene]], levels: Mapping[str, Le
              for name, each in found.items()}
     return rig_of_paths(
         alone, base, turned, paths,
-        None if speed is None else Metres.by(speed, start_s), config.rig)
+        None if speed is None else Metres.by(speed, start_s, WHEELS_SIGMA), config.rig)
 
 
 def _solved(scenes: Sequence[Scene], config: Config) -> Solution | None:

@@ -52,7 +52,7 @@ class Metres:
     sigma: float = 0.0
 
     @classmethod
-    def by(cls, speed: Samples, late_s: float, sigma: float = 0.0) -> Metres:
+    def by(cls, speed: Samples, late_s: float, sigma: float) -> Metres:
         """Return the metres by a measured speed. late_s: of its clock against the base's."""
         return cls(lambda seconds: speed.at(seconds + late_s)[:, 0], sigma)
 

@@ -24,6 +24,7 @@ from dashcalib_ros.input.motion import (
     SensorStream,
     local_metres,
     sensor_stream,
+    speed_sigma,
     speeds_of,
 )
 from dashcalib_ros.input.motion_files import bag_motion, read_motion
@@ -553,6 +554,9 @@ def test_speed_is_measured_or_comes_from_positions():
     backwards = sensor_stream({'speed': (stamps, np.full((len(stamps), 1), -3.0)),
                                'position': (stamps, places)}, 'a test')
     assert np.allclose(speeds_of(backwards).values, 3.0)
+    # wheels wear; positions do not
+    assert speed_sigma(backwards) > speed_sigma(sensor_stream(
+        {'position': (stamps, places)}, 'a test'))
     assert speeds_of(sensor_stream({'position': (stamps[:2], places[:2])}, 'a test')) is None
     assert speeds_of(SensorStream()) is None
 

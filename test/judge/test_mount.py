@@ -25,7 +25,7 @@ from dashcalib_ros.formats.ours import codes_of
 from dashcalib_ros.input.scale import FULL_SIZE
 from dashcalib_ros.judge import conclude
 from dashcalib_ros.judge.calibration import Mount
-from dashcalib_ros.judge.mount import mount_of
+from dashcalib_ros.judge.mount import Speed, mount_of
 from dashcalib_ros.report import write_results
 
 
@@ -35,7 +35,7 @@ def solution():
 
 
 def at(speed):
-    return lambda stamps_s: np.full(len(stamps_s), speed)
+    return Speed(lambda stamps_s: np.full(len(stamps_s), speed), 0.0)
 
 
 @pytest.mark.parametrize('angles', [(0.0, 0.0, 0.0), (3.5, -2.0, 1.0), (-2.5, 3.0, -3.0)])
@@ -144,6 +144,9 @@ def test_height_needs_a_speed_and_the_road(height_in):
     assert fast.height_m / found.height_m == pytest.approx(4.0 / 3.6)
     assert height_in([on_road(scene, points=12)], at(speed)).height_m is None
     assert height_in(seen, at(0.0)).height_m is None
+    vague = height_in(seen, replace(at(speed), sigma=0.03))
+    assert vague.sigma['height_m']**2 == pytest.approx(
+        found.sigma['height_m']**2 + (0.03 * found.height_m)**2)
 
 
 def test_kerbs_beside_the_path_are_no_road(height_in):
@@ -160,15 +163,15 @@ def test_the_speed_in_a_bend_does_not_count(height_in):
         middle = np.abs(asked_s - stamps_s.mean()) < 0.2 * np.ptp(stamps_s)
         return np.where(middle, 0.8 * speed, speed)
 
-    found = height_in([on_road(scene)], of_another_place)
+    found = height_in([on_road(scene)], Speed(of_another_place, 0.0))
     assert found.height_m == pytest.approx(HEIGHT_M, rel=0.01)
 
 
 def test_a_speed_that_begins_within_the_turn_gives_no_wrong_height(height_in):
     scene = scenes_of(1)[0]
     speed, stamps_s = speed_in(scene), scene.tracks.stamps_ns / 1e9
-    found = height_in([on_road(scene)],
-                      lambda asked_s: np.where(asked_s > stamps_s[2], speed, 0.0))
+    found = height_in([on_road(scene)], Speed(
+        lambda asked_s: np.where(asked_s > stamps_s[2], speed, 0.0), 0.0))
     assert found.height_m == pytest.approx(HEIGHT_M, rel=0.01)
 
 
@@ -189,7 +192,7 @@ def test_pairs_of_a_braking_car_are_left_out(solution):
     def slower(stamps_s):
         return SPEED - 2.0 * np.maximum(stamps_s - begins, 0.0) % SPEED
 
-    found = mount_of(drive, None, known, 'accepted', slower)
+    found = mount_of(drive, None, known, 'accepted', Speed(slower, 0.0))
     assert abs(found.pitch_up_deg - 1.0) < 0.15 and found.moved_s is None
 
 
