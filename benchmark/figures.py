@@ -18,6 +18,8 @@ from result_tables import BEGIN, END, RESULTS
 ROOT = Path(__file__).resolve().parents[1]
 NUMBER = r'[-+−]?\d+(?:[.,]\d+)*(?: ± \d+(?:\.\d+)?)?'
 COMMITS = r'[0-9a-f]{7}(?:, [0-9a-f]{7})*'
+# of a table on a page; what it says instead of more commits than a reader looks up
+CITED, LISTED = rf'\[(?:{COMMITS}|\d+ commits)\]', 3
 PARTS = '<!-- parts -->', '<!-- end of parts -->'
 # nothing older belongs on the front page
 MOST_COMMITS = 200
@@ -31,7 +33,7 @@ class Figure:
     """A place on a page that says what a table says.
 
     place: text of the page, once in it, however wrapped; each # is a number, @ the link to the
-    table, whose text is the table's commits. sources: what returns the numbers, in their order,
+    table, whose text is cited(). sources: what returns the numbers, in their order,
     from the table's text; [] where it does not.
     """
 
@@ -45,7 +47,7 @@ class Figure:
         """Return what the place looks like with any figures."""
         spaced = re.escape(self.place).replace('\\ ', r'\s+').replace('\\#', f'({NUMBER})')
         link = f'{"../" * self.page.count("/")}benchmark/results/{self.table}.md'
-        return re.compile(spaced.replace('@', rf'\[{COMMITS}\]\({re.escape(link)}\)'))
+        return re.compile(spaced.replace('@', rf'{CITED}\({re.escape(link)}\)'))
 
     def with_figures(self, text: str) -> str:
         """Return the page's text with the table's figures in the place. Raises ValueError."""
@@ -65,8 +67,14 @@ class Figure:
 
 def with_commits(text: str) -> str:
     """Return a page's text with the commits of each table that it links to by its commits."""
-    return re.sub(rf'\[{COMMITS}\](?=\([./]*benchmark/results/(\w+)\.md\))',
-                  lambda link: f'[{commits_of(table_of(link[1]))}]', text)
+    return re.sub(rf'{CITED}(?=\([./]*benchmark/results/(\w+)\.md\))',
+                  lambda link: f'[{cited(table_of(link[1]))}]', text)
+
+
+def cited(table: str) -> str:
+    """Return what pages say of the commits of a table: which they are, or how many."""
+    count = len(commits_of(table).split(', '))
+    return commits_of(table) if count <= LISTED else f'{count} commits'
 
 
 def table_of(name: str) -> str:
@@ -422,7 +430,9 @@ def rewrite(parts: str) -> list[str]:
     texts, wrong = pages(parts)
     for name, text in texts.items():
         (ROOT / name).write_text(text, 'utf-8')
-    for commit in sorted({*re.findall(r'(?<=[\[ ])[0-9a-f]{7}(?=[],])', texts[README])}):
+    tables = {figure.table for figure in FIGURES if figure.page == README}
+    for commit in sorted({commit for table in tables
+                          for commit in commits_of(table_of(table)).split(', ')}):
         count = subprocess.run(['git', 'rev-list', '--count', f'{commit}..HEAD'], cwd=ROOT,
                                capture_output=True, text=True, check=False).stdout.strip()
         if count and int(count) > MOST_COMMITS:

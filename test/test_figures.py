@@ -21,6 +21,7 @@ from figures import (  # noqa: E402
     README,
     Figure,
     cell,
+    cited,
     commits_of,
     table_of,
     with_commits,
@@ -52,11 +53,11 @@ def test_each_row_of_the_front_page_is_taken_from_a_table():
 @pytest.mark.parametrize('page', sorted({figure.page for figure in FIGURES}))
 def test_a_cited_commit_is_one_of_the_table_beside_it(page):
     text = (ROOT / page).read_text('utf-8')
-    cited = re.findall(r'\[([0-9a-f]{7}(?:, [0-9a-f]{7})*)\]\((?:\.\./)?benchmark/'
+    found = re.findall(r'\[([0-9a-f]{7}(?:, [0-9a-f]{7})*|\d+ commits)\]\((?:\.\./)?benchmark/'
                        r'results/(\w+)\.md\)', text)
-    assert cited
-    for commits, table in cited:
-        assert commits == commits_of(table_of(table)), f'{table}: python -m benchmark figures'
+    assert found
+    for commits, table in found:
+        assert commits == cited(table_of(table)), f'{table}: python -m benchmark figures'
 
 
 def test_the_tables_are_from_commits_of_this_repository():
@@ -81,6 +82,8 @@ def test_figures_are_put_where_they_belong(tmp_path, monkeypatch):
     said = with_commits(figure.with_figures(f'It says fx 3.1 px, at [1111111]{link}.'))
     assert said == f'It says fx 700.5 ± 1.5 px, at [0123abc, 4567def]{link}.'
     assert with_commits(figure.with_figures(said)) == said
+    assert cited('Measured at 0123abc, 1234bcd, 2345cde.') == '0123abc, 1234bcd, 2345cde'
+    assert cited('Measured at 0123abc, 1234bcd, 2345cde, 3456def.') == '4 commits'
     for wrong in (Figure('page', 'fy #', 'made', figure.sources),
                   Figure('page', 'fx # and #', 'made', figure.sources),
                   Figure('page', 'fx # px', 'made', (cell('two', 'fx, px'),))):
