@@ -87,17 +87,17 @@ class Linear:
         return _without_points(self, np.inf)
 
 
-def linearised(seen: Seen, loss_px: float, safe: bool = False) -> Linear:
+def linearised(seen: Seen, loss_px: float, safe: bool = False, alone: bool = False) -> Linear:
     """Return the used observations, linearised, under the Cauchy loss of this scale.
 
     Its weights are w = 1 / (1 + e^2 / loss^2): its gradient is w e, its curvature w^2 on average
     over the directions of e. safe: the curvature is w, that of a parabola which lies above the
-    loss: a step to the optimum is shorter, and lowers the cost.
+    loss: a step to the optimum is shorter, and lowers the cost. alone: what is shared is held.
     """
     stretch, observed, imaging = seen.stretch, seen.observed, seen.imaging
     coupled = imaging.coupled and stretch.trajectory.moves
-    shared, images = imaging.shared, [
-        block for block in imaging.of_each_image(stretch) if not block.turns]
+    shared = () if alone else imaging.shared
+    images = [block for block in imaging.of_each_image(stretch) if not block.turns]
     own = POSE + (MOTION if coupled else 0) + sum(block.count for block in images)
     size, count = POINT + own + sum(block.size for block in shared) + 1, len(seen.off)
     weight = weights(seen.off, loss_px)

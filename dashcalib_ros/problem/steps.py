@@ -198,23 +198,23 @@ def _tried(now: S, linear: Sequence[Linear], loss_px: float, unit: float, before
     tried = _Tried(now)
     for part in PARTS if trust.whole else (1.0,):
         after = step.taken(now, part)
-        for _ in range(SETTLING if trust.whole else 1):
+        for tries in range(SETTLING if trust.whole else 1):
+            if tries:
+                # far from the optimum poses and points follow in a curve
+                after = _settled(after, loss_px, unit)
             gain = before - after.cost(loss_px, unit)
             tried = _Tried(after, gain > (0.0 if trust.whole else WORTH * step.expected), gain,
                            gain / max(step.expected, 1e-300), part * step.shared_gain)
             if tried.lowers:
                 return tried
-            if trust.whole:
-                # far from the optimum poses and points follow in a curve
-                after = _settled(after, loss_px, unit)
     return tried
 
 
 def _settled(now: S, loss_px: float, unit: float) -> S:
     """Return the state with poses and points one step nearer to what all else asks of them."""
-    linear = now.linear(loss_px, safe=True)
+    linear = [linearised(each, loss_px, safe=True, alone=True) for each in now.seen]
+    follows = [normal_equations(each, unit).follow(NONE) for each in linear]
     still = np.zeros(len(now.imaging.names))
-    follows = [normal_equations(each, unit).follow(still) for each in linear]
     return replace(_Step(still, follows, 0.0, 0.0).taken(now, 1.0), last=now.last)
 
 

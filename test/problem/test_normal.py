@@ -68,6 +68,19 @@ def test_poses_follow_what_is_shared_as_the_normal_equations_say(readout_s):
     np.testing.assert_allclose(twice, 2 * known.covariance, rtol=1e-8, atol=1e-15)
 
 
+@pytest.mark.parametrize('readout_s', [0.0, READOUT_S])
+def test_poses_go_where_they_go_when_what_is_shared_takes_no_step(readout_s):
+    scene = small_scene(LENS)
+    seen = imaging_of(LENS, scene, readout_s).seen(scene)
+    every = normal_equations(linearised(seen, 1.0))
+    every = every.follow(np.zeros(len(every.cost.score)))
+    alone = normal_equations(linearised(seen, 1.0, alone=True)).follow(np.zeros(0))
+    assert np.abs(every.poses).max() > 1e-6
+    np.testing.assert_allclose(alone.poses, every.poses, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(alone.points, every.points, rtol=1e-6, atol=1e-9)
+    assert alone.images.keys() == every.images.keys()
+
+
 def as_seen(scene: Scene, imaging: Imaging, noise_px: float = 0.02) -> Scene:
     """Return a turn with its tracks where they are by the imaging, up to noise.
 
