@@ -156,7 +156,7 @@ def _mapping(rows: Sequence[Row]) -> str:
     """Return for each kind of lens whether it was recognised, and the errors in pixels."""
     rows = [row for row in rows if row.get('truth_model') and row['must'] != 'refuse']
     lines = []
-    # what is known of a recorded drive's lens is not exact
+    # what is known about a recorded drive's lens is not exact
     kinds = {(bool(row.get('recorded')), row['truth_model']) for row in rows}
     for recorded, truth in sorted(kinds):
         of_truth = [row for row in rows
@@ -264,7 +264,7 @@ def _met(condition: bool) -> str:
 RECORDED = {'kitti03': 'bag', 'carnd': 'drive.mp4', 'ntu_campus': 'images'}
 # images per second, of folders
 FPS = {'ntu_campus': 3.0}
-# what is known of a lens, where that is not all
+# what is known about a lens, where that is not all
 KNOWN = {'ntu_campus': ('fx', 'fy')}
 
 

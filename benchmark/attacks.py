@@ -61,7 +61,7 @@ RENDERED = ('dashcam: bonnet, text', 'KITTI raw lens, 1392x512', '640x480, fy/fx
 RECORDED = {'kitti03': ('bag', None), 'kitti07': ('images', 9.65), 'ntu_campus': ('images', 3.0)}
 # the frames in the middle of the turns
 TURNS = {'kitti03': (88,), 'kitti07': (25, 137)}
-# what is known of the truth, where that is not all. KITTI's K lacks a k1 of 0.02: fx is what
+# what is known about the truth, where that is not all. KITTI's K lacks a k1 of 0.02: fx is what
 # pictures and true rotation together say
 KNOWN = {'kitti03': ('fx',), 'kitti07': ('fx',), 'ntu_campus': ('fx', 'fy')}
 TRUE_FX = {'kitti03': 718.2, 'kitti07': 701.9}

@@ -72,7 +72,7 @@ def with_commits(text: str) -> str:
 
 
 def cited(table: str) -> str:
-    """Return what pages say of the commits of a table: which they are, or how many."""
+    """Return what pages say about the commits of a table: which they are, or how many."""
     count = len(commits_of(table).split(', '))
     return commits_of(table) if count <= LISTED else f'{count} commits'
 

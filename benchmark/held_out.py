@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""What each turn says of the calibration without it, over all drives that are solved.
+"""What each turn says about the calibration without it, over all drives that are solved.
 
     python benchmark/held_out.py --cache DIR [--out DIR] [--results] [--refit NAME ...]
 

@@ -81,7 +81,7 @@ def found_lines(frames: Iterable[Frame], config: Config) -> tuple[Lines, float]:
 
 
 def rendered_row(name: str, seed: int, cache: Path) -> dict[str, Any]:
-    """Return what lines say of the true camera of a drive, and of spoiled ones."""
+    """Return what lines say about the true camera of a drive, and of spoiled ones."""
     drive, config = made(name, seed), Config()
     camera = true_camera(drive)
     scale = Scale.of(camera.image_size, config)
@@ -93,7 +93,7 @@ def rendered_row(name: str, seed: int, cache: Path) -> dict[str, Any]:
 
 
 def whole_row(name: str, seed: int, cache: Path) -> dict[str, Any]:
-    """Return what lines say of the calibration of a drive that check.py has solved."""
+    """Return what lines say about the calibration of a drive that check.py has solved."""
     found = solved_drive(name, seed, cache).calibration
     lines = found.straight_lines
     return {'verdict': found.verdict.level, 'reasons': found.verdict.reasons,
@@ -101,7 +101,7 @@ def whole_row(name: str, seed: int, cache: Path) -> dict[str, Any]:
 
 
 def kitti_rows(data: Path, config: Config) -> dict[str, Any]:
-    """Return what lines say of KITTI's K, of our camera and of its spoiled ones; and the cost."""
+    """Return what lines say about KITTI's K, our camera and its spoiled ones; and the cost."""
     path = data / 'kitti03'
     with Calibrator(config) as calibrator:
         for frame in open_frames(path / 'bag'):
@@ -123,7 +123,7 @@ def kitti_rows(data: Path, config: Config) -> dict[str, Any]:
 
 
 def other_rows(data: Path, config: Config) -> dict[str, Any]:
-    """Return what lines say of cameras that others measured, and of these without distortion."""
+    """Return what lines say about cameras that others measured, and these without distortion."""
     rows = {}
     for name, drive, fps in OTHERS:
         folder = data / name

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a gyro and GPS say of fx: rendered drives, and real ones with poses or sensors.
+"""What a gyro and GPS say about fx: rendered drives, and real ones with poses or sensors.
 
     python benchmark/motion.py [--data data] [--seeds 1 2 3] [--single 20] [--towns 40] [--results]
 
@@ -137,7 +137,7 @@ def row(drive: Driven, stream: SensorStream, sensor: str = 'gyro',
 
 
 def harm(drive: Driven, stream: SensorStream) -> list[str]:
-    """Return what sensors do that are off, and what they say of a camera that is."""
+    """Return what sensors do that are off, and what they say about a camera that is."""
     solution = drive.solution
     unknown = asked(drive, scaled(stream, 1.03), scale_sigma=Config().motion.gyro_scale_sigma)
     assert unknown.solution is not None

@@ -111,7 +111,7 @@ def chained(known: Mapping[str, Any], poses: Poses, names: Sequence[str]
             own = TruePath(*(np.array(known[str(start)][name][key])
                              for key in ('rotations', 'positions')))
             if before is not None and start - before[0] == STEP:
-                # as long as the window before says of the frames that both have
+                # as long as the window before says about the frames that both have
                 shared = slice(step, keyframes)
                 scale *= (length(before[1].positions[shared])
                           / length(own.positions[:keyframes - step]))

@@ -223,7 +223,7 @@ def main() -> None:
             done[name] = {'commit': at, 'rows': rows}
             save(path, done)
             print('\n'.join(rows), flush=True)
-    # the table first, then what is said of the real pair
+    # the table first, then what is said about the real pair
     lines = sorted((row for each in done.values() for row in each['rows']),
                    key=lambda row: not row.startswith('|'))
     keep_table('rig', '\n'.join([HEAD, *lines, '', summary(lines)]), args,

@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""What drives without a sharp turn know of the focal length: pieces of real ones, rendered ones.
+"""What drives without a sharp turn know about the focal length: pieces of real and rendered ones.
 
     python benchmark/without_turns.py [--data DIR] [--seconds S] [--drives NAME ...]
                                       [--seeds 8000-8009] [--spoilt NAME ...] [--fleet]
@@ -11,7 +11,7 @@ left out. A seed draws a camera and a street as population.py does, and a drive 
 with bumps: straight with lane keeping, or bends of 100 to 800 m radius. Each is calibrated
 three times: without knowing anything, with known.stabiliser=no, and with nothing but the speed
 of the car and known.height, to 2 cm. --spoilt: rendered drives whose pictures a stabiliser moved,
-or that were zoomed or cropped; nothing is known of them, or speed and height. --fleet: pieces
+or that were zoomed or cropped; nothing is known about them, or speed and height. --fleet: pieces
 without a sharp turn, as the clips of one camera of a fleet; there is no stabiliser.
 Rows go to DIR/without_turns.json; what is there is not run again. --results writes the table into
 benchmark/results/without_turns.md.
@@ -46,7 +46,7 @@ from dashcalib_ros.input.motion import Samples, SensorStream
 from dashcalib_ros.input.poses import read_poses
 from dashcalib_ros.judge import CalibrationData
 
-# what is known of the camera, as the table says it; 'height' is m above the road
+# what is known about the camera, as the table says it; 'height' is m above the road
 KNOWN = {'not known': '', 'no': 'no', 'not known; speed and height are': 'height'}
 # m, what a tape measure is worth
 TAPE_M = 0.02

@@ -114,7 +114,7 @@ class TurnsConfig:
 
 @dataclass(frozen=True)
 class KnownConfig:
-    """What somebody knows of the camera; with a sigma after ±, else it counts as exact."""
+    """What somebody knows about the camera; with a sigma after ±, else it counts as exact."""
 
     stabiliser: str = setting(
         '', "no: the pictures are not stabilised, so that bumps and gentle bends count; '': not "

@@ -91,7 +91,7 @@ class Calibrator(AbstractContextManager['Calibrator']):
         return self.status()
 
     def sense(self, motion: SensorStream | None, warmth: SensorStream | None = None) -> None:
-        """Take what the car's sensors say of the drive so far, in the place of what came before.
+        """Take what the car's sensors say about the drive so far; it replaces what came before.
 
         Stamps count from the first image. warmth: has the temperature, where motion has not.
         """
@@ -164,7 +164,7 @@ class Calibrator(AbstractContextManager['Calibrator']):
     def _solve(self, config: Config, progress: Progress, final: bool
                ) -> tuple[list[Scene], Solution | None]:
         while scenes := self.reconstruct(progress, final):
-            stood = spared('what the speed says of the turns', self._lost,
+            stood = spared('what the speed says about the turns', self._lost,
                            agreement.turns_that_stood, scenes, self._motion,
                            self.detection.start_s)
             if stood:

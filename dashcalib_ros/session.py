@@ -70,7 +70,7 @@ class Recording:
 
 @dataclass(frozen=True)
 class Checked:
-    """What a drive says of a given camera.
+    """What a drive says about a given camera.
 
     changes: of the camera during the drive, in words. odometry: the motion in the turns beside
     true poses; None without poses.

@@ -63,7 +63,7 @@ def base_poses(times: np.ndarray, yaw_deg: float, world: int) -> tuple[np.ndarra
 def made_paths(cameras: Mapping[str, Mounted], yaws: Sequence[float] = (85.0, -75.0, 90.0),
                seed: int = 0, turn_deg: float = 0.005, move: float = 0.002,
                lens_sigma: float = 1.0) -> tuple[dict[str, CameraPaths], dict[str, np.ndarray]]:
-    """Return what cameras know of turns, 40 s apart, and how far each one's lens is off.
+    """Return what cameras know about turns, 40 s apart, and how far each one's lens is off.
 
     turn_deg, move (of a step): noise of poses, of which a half is known. lens_sigma: of three
     parameters, in units of 0.1 degrees about the vertical, 0.1 about x, and 0.3 % of the turning.

@@ -18,7 +18,7 @@ from dashcalib_ros.camera.mapping import grid_of
 # of x and y together; 5 left 1.1 px of a windscreen's 2, and 7 0.3
 DEGREE = 7
 TERMS = tuple((i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i))
-# what result.json says of the coefficients
+# what result.json says about the coefficients
 BASIS = {
     'about': 'px by which a pixel (u, v) is observed beside where the model sees it: the sum over '
              'n of coefficients[axis][n] P_i(x) P_j(y), with (i, j) = degrees[n], Legendre '

@@ -240,7 +240,7 @@ SETTINGS: tuple[Argument, ...] = (
                'help': 'one setting, over those of --config; may be repeated'}))
 KNOWN: Argument = ('--known', {
     'action': 'append', 'default': [], 'metavar': 'NAME=VALUE',
-    'help': 'what you know of the camera: stabiliser=no, shutter=global or 24ms, fx=1160±20, '
+    'help': 'what you know about the camera: stabiliser=no, shutter=global or 24ms, fx=1160±20, '
             'hfov=120±5, aspect=1, with a speed height=1.45±0.03 (m above the road); may be '
             'repeated'})
 QUIET: Argument = ('--quiet', {
@@ -396,7 +396,7 @@ COMMANDS = {
             ('--match', {'action': 'store_true',
                          'help': 'use what two cameras see at the same time, too; without it that '
                                  'is a witness only'}),
-            ('--known', {**KNOWN[1], 'help': 'what you know of all cameras, as for run; '
+            ('--known', {**KNOWN[1], 'help': 'what you know about all cameras, as for run; '
                                              'height=1.45±0.03, of the base, gives metres '
                                              'without a speed'}),
             *SETTINGS, SEED, out_folder('rig', '; --json prints rig.json'), JSON, QUIET),

@@ -123,7 +123,7 @@ def _rig(args: argparse.Namespace, config: Config, started: float) -> int:
 
 
 def truth_of(drive: Drive) -> dict[str, Any]:
-    """Return what truth.json says of a drive: the lens, and what else a calibration may find."""
+    """Return what truth.json says about a drive: the lens, and what else a run may find."""
     width, height = drive.lens.size
     spec, glass = drive.spec, drive.lens.glass
     found: dict[str, Any] = {'model': drive.lens.model, **drive.truth, 'width': width,

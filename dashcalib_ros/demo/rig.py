@@ -79,7 +79,7 @@ class TruePlace:
 
     @property
     def values(self) -> dict[str, object]:
-        """Return what truth.json says of it."""
+        """Return what truth.json says about it."""
         return {'rotation_deg': np.degrees(rotation_vectors(self.rotation[None])[0]).tolist(),
                 'translation_m': self.translation_m.tolist(),
                 'time_offset_s': self.time_offset_s}

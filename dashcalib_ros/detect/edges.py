@@ -5,7 +5,7 @@ Only edges within 45 degrees of the picture's columns are looked for: poles, the
 doors and windows stand upright and are straight. What lies on the ground is not: kerbs and lane
 marks follow the road's bends, and whatever crosses the road follows its camber; wires sag.
 
-Nothing is known of the camera here, so an edge may be curved, but not by more than a cubic.
+Nothing is known about the camera here, so an edge may be curved, but not by more than a cubic.
 """
 from __future__ import annotations
 

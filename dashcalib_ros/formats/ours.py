@@ -272,7 +272,7 @@ def _has_block(data: Any) -> bool:
 
 
 def _read(data: Data, path: Path) -> NamedCamera:
-    """Return the camera, with what else the file says of it; all of that may be missing."""
+    """Return the camera, with what else the file says about it; all of that may be missing."""
     if _has_block(data):
         values, found = data[ros.OWN], opencv.read(data, path)
     else:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the car knows of its own motion: streams of a gyro, a speed and positions.
+"""What the car knows about its own motion: streams of a gyro, a speed and positions.
 
 A stream's stamps are seconds since the drive's first image, on the sensor's own clock: how far
 that is off is found later, from the turns (judge/witnesses.py). A stream that cannot be used is
@@ -46,7 +46,7 @@ FASTEST_TURN = 6.0
 QUANTILE = 99.0
 # degrees Celsius; kelvins were written for them
 HOTTEST_C = 150.0
-# m/s; a car that is slower stands; a sensor that never says more does not know of driving
+# m/s; a car that is slower stands; a sensor that never says more does not know about driving
 STANDING_MPS, DRIVING_MPS = 0.3, 3.0
 # s over which positions tell a speed
 SPEED_OVER_S = 1.0

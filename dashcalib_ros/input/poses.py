@@ -39,7 +39,7 @@ class Poses:
 
     rotations: (n, 3, 3) to the world; positions: (n, 3) in metres. stamps_s: (n,) ascending, or
     None where the poses are those of the input's frames, one by one. warnings: what the user
-    should know of them. longest_gap_s: between two, over which they are not interpolated.
+    should know about them. longest_gap_s: between two, over which they are not interpolated.
     """
 
     rotations: Floats

@@ -254,7 +254,7 @@ def _length_s(container: InputContainer, stream: av.VideoStream) -> float:
 
 
 def _chosen(path: Path, topic: str | None) -> tuple[int | None, list[Notice]]:
-    """Return the number of the wanted stream, and what is to be said of the choice."""
+    """Return the number of the wanted stream, and what is to be said about the choice."""
     with _opened(path) as (container, best):
         streams = _streams(container)
         there = ', '.join(f'{n}: {size_text((each.width, each.height))}'

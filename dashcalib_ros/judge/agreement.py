@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the turns agree on one camera, and what each of them, and one more, knows of fx."""
+"""Whether the turns agree on one camera, and what each of them, and one more, knows about fx."""
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence, Set
@@ -128,7 +128,7 @@ class FocalEstimate:
 
 
 def focal_of_turns(solution: Solution) -> dict[TurnId, FocalEstimate]:
-    """Return what each turn says of fx alone, linearised at the common result.
+    """Return what each turn says about fx alone, linearised at the common result.
 
     Sigma cannot hold how much turns differ: one turn does not show that.
     """
@@ -136,7 +136,7 @@ def focal_of_turns(solution: Solution) -> dict[TurnId, FocalEstimate]:
 
 
 def focal_of(solution: Solution, places: Iterable[int]) -> FocalEstimate:
-    """Return what some of the turns say of fx, where only their noise makes turns differ."""
+    """Return what some of the turns say about fx, where only their noise makes turns differ."""
     some = solution.posterior.alike.of(places)
     return FocalEstimate(solution.camera.fx + float(solution.offset_of(some)[0]),
                          float(np.sqrt(solution.carried(some.covariance)[0, 0])))

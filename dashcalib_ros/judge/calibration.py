@@ -179,7 +179,7 @@ class Witness:
 
     @property
     def clock(self) -> dict[str, Any]:
-        """Return what is known of the clock, by the names in result.json."""
+        """Return what is known about the clock, by the names in result.json."""
         return {name: getattr(self, name) for name in (
             'time_offset_s', 'time_sigma_s', 'drift_ppm', 'drift_sigma_ppm')}
 
@@ -527,7 +527,7 @@ class CalibrationData:
     def samples(self, count: int, seed: int = 0) -> tuple[Camera, ...]:
         """Return cameras as likely as this one: draws from the normal distribution around it.
 
-        They carry on through any pipeline what is not known of the lens. They are of the next
+        They carry on through any pipeline what is not known about the lens. They are of the next
         larger lens model, for what this one leaves out counts, too. The same seed gives the same
         cameras. Raises InputError where there is no camera, or its covariance is not known.
         """

@@ -32,7 +32,7 @@ from dashcalib_ros.solve.spread import PictureSigma
 
 @dataclass(frozen=True, repr=False)
 class Check:
-    """What a drive says of a calibration that was given.
+    """What a drive says about a calibration that was given.
 
     answer: right: the given camera and the drive's own are the same within what the drive can
     determine, and near enough for the uses in good_for. differs: the difference is more than
@@ -44,8 +44,8 @@ class Check:
     own, in standard deviations (sigma) with all correlations; limit: what chance exceeds once in
     a thousand drives. loss: by how much worse the turns are explained when they must use the
     given camera, of the cost with their own; None where it was not tried. straight_lines: what
-    they say of the given camera; None where there are too few. bound_px: what the given camera's
-    error stays below with 95 % confidence. limits_px: by use, what rms_px may be; bound_px may be
+    they say about the given camera; None where there are too few. bound_px: below which its error
+    stays with 95 % confidence. limits_px: by use, what rms_px may be; bound_px may be
     twice that. good_for: the uses that allow the difference. remedy: of what else is wrong than
     the lens itself.
     """
@@ -263,7 +263,7 @@ def scaled_parameters(found: Difference, compare: Compare) -> str:
 
 def with_lines(found: Check, given: Camera, lines: Lines, image_size: tuple[int, int],
                config: Config) -> Check:
-    """Return a check with what straight lines say of the given camera, if there are enough.
+    """Return a check with what straight lines say about the given camera, if there are enough.
 
     lines: of the resized pictures. image_size: of the drive's. Lines alone call no camera wrong:
     where they contradict one that the turns call right, the drive cannot tell. One that differs

@@ -126,7 +126,7 @@ def of_steps(apart_s: Floats, ratio: float) -> Floats:
 
 
 def clock(offset_s: float, sigma_s: float, pace: float, pace_sigma: float) -> Witness:
-    """Return what is known of a clock; its drift only where the drive is long enough."""
+    """Return what is known about a clock; its drift only where the drive is long enough."""
     long = pace_sigma <= LARGEST_DRIFT_SIGMA
     return Witness(offset_s, sigma_s, drift_ppm=1e6 * pace if long else None,
                    drift_sigma_ppm=1e6 * pace_sigma if long else None)
@@ -183,7 +183,7 @@ class _Rows:
 
 
 def _fitted(paths: Sequence[Path], samples: Samples) -> Witness | None:
-    """Return what the turns say of the clock, at the middle of their times."""
+    """Return what the turns say about the clock, at the middle of their times."""
     plane = samples.values.shape[1] > 1
     curves, middle_s = _curves(paths, plane), float(np.mean([
         path.stamps_s.mean() for path in paths])) if paths else 0.0

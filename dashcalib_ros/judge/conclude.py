@@ -252,7 +252,7 @@ def _drift(solution: Solution) -> Drift | None:
 
 
 def _warmth(solution: Solution, evidence: Evidence) -> Warmth | None:
-    """Return the temperature of the turns; None where it is not known of all."""
+    """Return the temperature of the turns; None where it is not known about all."""
     return Warmth.over(evidence.temperature, [
         scene.tracks.stamps_ns for scene in solution.scenes if scene.turn.of_this_drive])
 
@@ -299,7 +299,7 @@ REPORTED_FIELD_PX = 0.5
 
 def _warnings(found: CalibrationData, solution: Solution, evidence: Evidence
               ) -> tuple[Notice, ...]:
-    """Return what the user must know of the numbers, which does not change the verdict."""
+    """Return what the user must know about the numbers, which does not change the verdict."""
     level, model, field = found.verdict.level, found.config.model, found.field
     warnings = []
     if evidence.temperature is not None and _warmth(solution, evidence) is None:
@@ -369,7 +369,7 @@ def _warnings(found: CalibrationData, solution: Solution, evidence: Evidence
 
 
 def straight_lines(solution: Solution | None, evidence: Evidence) -> Bend | None:
-    """Return what straight lines say of the solution, in the resized images."""
+    """Return what straight lines say about the solution, in the resized images."""
     if solution is None or evidence.lines is None:
         return None
     lines, field = evidence.lines, solution.field

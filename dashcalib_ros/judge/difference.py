@@ -60,7 +60,7 @@ class Difference:
 
     offsets: (n,) given minus found, in the parameters of a model that has both; covariance: (n, n)
     of them; None where neither is known. apart: how far both see a ray; None where they cannot be
-    compared. sigma_px: of what is known of both, over the picture.
+    compared. sigma_px: of what is known about both, over the picture.
     """
 
     given: Camera
@@ -447,7 +447,7 @@ def _centre(found: Difference, offsets: Floats, sigmas: Floats) -> str:
 
 def _distortion(found: Difference, offsets: Floats, sigmas: Floats) -> str:
     off = list(zip(found.found.names()[4:], offsets, sigmas, strict=True))
-    # some compensate each other: what is known of them together may be known of none alone
+    # some compensate each other: what is known about them together may be known about none alone
     shown = [each for each in off if abs(each[1]) > 2 * each[2]] or off
     values = []
     for name, value, sigma in shown:

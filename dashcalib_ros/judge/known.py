@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What somebody knows of the camera, as measurements beside the turns: known.* of the settings."""
+"""What somebody knows about the camera (known.*), as measurements beside the turns."""
 from __future__ import annotations
 
 import re

@@ -288,7 +288,7 @@ class Monitor:
         covariance = self.covariance if trusted else UNKNOWN**2 * self.covariance
         known = Quadratic.prior(np.asarray(np.linalg.inv(covariance)))
         others = Quadratic.together([self._together(before), known])
-        # the share of the newest turns in what all turns together say of an error alike in all
+        # the share of the newest turns in what all turns together say about an error alike in all
         share = newer.hessian @ np.linalg.inv(newer.hessian + others.hessian)
         information = basis.T @ (newer.hessian - share @ newer.hessian) @ basis
         pull = basis.T @ (newer.score - share @ (newer.score + others.score))

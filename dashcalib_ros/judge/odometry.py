@@ -4,7 +4,7 @@
 The turns' paths become files in TUM's format, which evo reads and plots.
 
 Each turn is adjusted with each camera held, all alike. The angle of a turn's rotation is the same
-in every frame that is fixed to the car: nothing has to be known of where the poses' sensor sits.
+in every frame that is fixed to the car, so it does not matter where the poses' sensor sits.
 """
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ class Grounds:
     """What a verdict rests on.
 
     lines: what straight lines show of the solution; None where there are too few. witnesses: what
-    sensors know of it. other_camera: a second one in the same stream.
+    sensors know about it. other_camera: a second one in the same stream.
     """
 
     solution: Solution
@@ -382,7 +382,7 @@ def _not_fixed(grounds: Grounds) -> Finding | None:
     """
     solution = grounds.solution
     known = _relative_sigma(solution)
-    # a zoom that is smaller than what is known of the focal length is none
+    # a zoom that is smaller than what is known about the focal length is none
     clear = [each for each in solution.fixed_camera
              if each.clear and not (each.kind == 'zoom' and each.size < known)]
     crop = largest_crop(solution.crops) if crop_matters(solution) else 0.0

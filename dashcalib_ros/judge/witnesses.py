@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a gyro and GPS know of a solution: the angles of the turns, without any picture.
+"""What a gyro and GPS know about a solution: the angles of the turns, without any picture.
 
 A turn's angle by the pictures depends on the focal length; by a gyro it does not. The model: from
 keyframe to keyframe the camera turned by phi, in its own axes; the sensor by theta, in its axes,

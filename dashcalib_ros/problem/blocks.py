@@ -87,7 +87,7 @@ Self = TypeVar('Self', bound='Block')
 
 @dataclass(frozen=True)
 class Block:
-    """A kind of unknown: its value, and what the problem must know of it.
+    """A kind of unknown: its value, and what the problem must know about it.
 
     held: it does not move, and costs nothing.
     """
@@ -472,7 +472,7 @@ class Warmth:
 
     @classmethod
     def over(cls, samples: Samples | None, turns_ns: Sequence[Ints]) -> Warmth | None:
-        """Return that of turns, by the stamps (k,) of each; None where it is not known of all."""
+        """Return that of turns, by the stamps (k,) of each; None where one of them is unknown."""
         if samples is None or not turns_ns:
             return None
         stamps_s = np.concatenate(turns_ns) / 1e9
@@ -670,7 +670,7 @@ class Imaging:
         return found.value if isinstance(found, ImageBlock) else {}
 
     def steering(self, stretch: Stretch) -> Floats:
-        """Return the (3, 3) projection of how the camera turns on what the poses can say of it.
+        """Return the (3, 3) projection of how the camera turns on what the poses can say about it.
 
         With Shake, about the axis of turns alone: between two keyframes bumps turn a camera to and
         fro about the other axes, so the difference of the poses does not say how fast.
@@ -805,7 +805,7 @@ def middle(image_size: tuple[int, int]) -> Floats:
 
 
 def imaging_with(camera: Camera, stretches: Sequence[Stretch] = ()) -> Imaging:
-    """Return the imaging by a lens, where nothing is known of the other blocks."""
+    """Return the imaging by a lens, where nothing is known about the other blocks."""
     basis = field_basis(camera)
     return Imaging.of(
         Lens(camera), Readout(), Smooth(np.zeros(basis.shape[1]), basis),

@@ -261,7 +261,7 @@ def normal_equations(linear: Linear, variance: float = 1.0, kept: Sequence[str] 
 
 @dataclass(frozen=True)
 class PosesGivenShared:
-    """What a stretch says of its k poses where what is shared is known, the points eliminated.
+    """What a stretch says about its k poses where what is shared is known, the points eliminated.
 
     covariance: (6k, 6k) without the gauge, which is free; follow: (6k, g) of the poses by what is
     shared.
@@ -272,7 +272,7 @@ class PosesGivenShared:
 
 
 def poses_given_shared(linear: Linear, variance: float) -> PosesGivenShared:
-    """Return what a stretch says of its poses, its blocks of images free; variance: px^2."""
+    """Return what a stretch says about its poses, its blocks of images free; variance: px^2."""
     whole, _ = linear.without_points
     gone = [name for name in linear.extras if name != 'motion']
     first = np.concatenate([linear.extras[name] for name in gone])

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a turn knows of the camera: its cost near the solution, as a quadratic function.
+"""What a turn knows about the camera: its cost near the solution, as a quadratic function.
 
 Around the solution a turn's cost changes with a step d of the parameters by
 
     d' H d - 2 g' d
 
 where H, the hessian, is the turn's information about the parameters, and g, the score, says where
-the turn alone would rather go. All that is said of a camera's uncertainty comes from a few
+the turn alone would rather go. All that is said about a camera's uncertainty comes from a few
 operations on such functions: those of several turns are added up, and a prior is one more of
 them; parameters are fixed at the solution, or left free and eliminated; the sum has an optimum and
 a covariance. So nothing has to be adjusted again to know the camera without a turn, or with more

@@ -21,7 +21,7 @@ HEIGHT = 320  # px of a drawing
 
 
 def rig_html(rig: RigCalibration, cameras: Sequence[Placed]) -> str:
-    """Return a page of a rig: the car from above and from the side, and what is known of it.
+    """Return a page of a rig: the car from above and from the side, and what is known about it.
 
     cameras: those that have a place, the base first.
     """

@@ -176,7 +176,7 @@ def picture_svg(shown: TurnPicture, scene: Scene | None, camera: Camera | None,
     drawn = picture(data_uri(shown.image), width, height) + mask_over(mask_id, width, height)
     magnified = 0
     at = -1 if scene is None else int(np.searchsorted(scene.tracks.frames, shown.frame))
-    # no tracks are known of a picture that is not a keyframe of the turn
+    # no tracks are known about a picture that is not a keyframe of the turn
     if scene is not None and shown.frame in scene.tracks.frames:
         px = width / scene.tracks.image_size[0]
         xy = resized_pixels(scene.tracks.xy, px)

@@ -106,7 +106,7 @@ def mount_text(mount: Mount) -> str:
 
 
 def witness_texts(witnesses: Witnesses) -> list[str]:
-    """Return a line for each sensor: what it knows of the focal length, and of its clock."""
+    """Return a line for each sensor: what it knows about the focal length, and of its clock."""
     lines = []
     for name, each in (('gyro', witnesses.gyro), ('GPS', witnesses.gps),
                        ('odometry', witnesses.odometry)):
@@ -134,7 +134,7 @@ UNITS = {'fx': (' px', 1.0), 'hfov': ('°', 1.0), 'shutter': (' ms', 1e3), 'heig
 
 
 def known_text(piece: Known) -> str:
-    """Return what somebody knew of the camera, what the turns say, and what it contributed."""
+    """Return what somebody knew about the camera, what the turns say, and what it contributed."""
     unit, times = UNITS.get(piece.name, ('', 1.0))
     known, turns = (f'{times * value:.5g} ± {times * sigma:.2g}{unit}' for value, sigma in (
         (piece.value, piece.sigma), (piece.by_turns, piece.by_turns_sigma)))
@@ -215,7 +215,7 @@ def next_steps(c: CalibrationData, folder: str = FOLDER) -> list[str]:
 
 
 def run_facts(c: CalibrationData) -> list[tuple[str, str]]:
-    """Return what else is known of the run: a name, and a text."""
+    """Return what else is known about the run: a name, and a text."""
     facts = [('images', f'{c.frames} of {c.image_size[0]} × {c.image_size[1]} px')]
     clips = any(turn.clip for turn in c.stored_turns)
     for name, turns in (('turns', c.turns), (

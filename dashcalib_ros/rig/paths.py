@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What one camera knows of the path of the car: the poses of each of its scenes, with covariance.
+"""What one camera knows about the path of the car: poses of each of its scenes, with covariance.
 
 The poses of a scene follow the lens; how they do is known from the scene's normal equations. So a
 lens that is known badly makes a rotation of the rig that is known badly, and a rig whose poses fit
@@ -65,7 +65,7 @@ class ScenePath:
 
 @dataclass(frozen=True)
 class CameraPaths:
-    """All that a camera knows of the car's path. start_s: stamp of its first image.
+    """All that a camera knows about the car's path. start_s: stamp of its first image.
 
     lens_covariance: (n, n) of its lens and, last, its readout (s), by all of its scenes.
     """
@@ -82,7 +82,7 @@ LEAST_READOUT_SIGMA_S = 1e-5
 
 def camera_paths(name: str, solution: Solution, stretches: Sequence[Retraced], start_s: float
                  ) -> CameraPaths:
-    """Return what a camera knows of the car's path."""
+    """Return what a camera knows about the car's path."""
     imaging, found, start_ns = imaging_of(solution), [], round(start_s * 1e9)
     for each in sorted(stretches, key=lambda each: int(each.scene.tracks.stamps_ns[0])):
         scene = each.scene

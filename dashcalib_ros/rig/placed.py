@@ -30,7 +30,7 @@ NOTHING: Sights = ('not visible', 'not visible', 'not visible')
 WEAK = 10.0
 # of the prior's sigma: where more of it is left, a translation is not visible
 PRIOR_LEFT = 0.5
-# degrees, m and s by which one stretch may be off beyond all that is known of it: of the real
+# degrees, m and s by which one stretch may be off beyond all that is known about it: of the real
 # pair (benchmark/results/rig.md) by 0.05 degrees about the optical axis, at a sigma of 0.01
 STRETCH = np.array([0.05, 0.05, 0.05, 0.02, 0.02, 0.02, 0.0005])
 # minimum number of stretches for what is accepted: nothing confirms a single one
@@ -100,7 +100,7 @@ class RigCalibration:
 
 @dataclass(frozen=True)
 class Alone:
-    """What is known of a camera without the others. calibration: the path of its result.
+    """What is known about a camera without the others. calibration: the path of its result.
 
     level: of its lens. start_s: stamp of its first image. scenes: how many may say where it sits.
     """

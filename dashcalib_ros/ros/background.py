@@ -77,7 +77,7 @@ class Measured:
 class Result:
     """A calibration; complete: it had all the turns wanted; bank: the number of their bank.
 
-    given, check: a camera that was to be checked, and what the calibration says of it.
+    given, check: a camera that was to be checked, and what the calibration says about it.
     """
 
     calibration: Calibration
@@ -89,7 +89,7 @@ class Result:
 
 @dataclass(frozen=True)
 class Watched:
-    """What the turns so far say of a camera in use."""
+    """What the turns so far say about a camera in use."""
 
     camera: NamedCamera
     monitor: Monitor
@@ -164,7 +164,7 @@ class _Bank:
     calibration is to begin with the present turns. failures: of calibrations in a row.
     not_before: when the next one may begin, in s of time.monotonic(). read: the turns that were
     compared with the camera in use; readings: what they say. earlier: what those of the
-    banks before said of it. pairs: of straight driving that were asked whether it was moved;
+    banks before said about it. pairs: of straight driving that were asked whether it was moved;
     moved: whether they said so.
     """
 

@@ -190,7 +190,7 @@ class Calibrating:
                     self._count(judged, calibration)
                 log = self._log.warning if judged.contradictions else self._log.info
                 log(outcome_text(calibration, judged.why))
-        # turns that do not confirm it may be all that is known of another camera: they stay
+        # turns that do not confirm it may be all that is known about another camera: they stay
         if judged.action == 'keep' and result.complete and (
                 judged.confirmed or not self.drive.learner.extend()):
             # the next calibration must be independent: it uses new turns only

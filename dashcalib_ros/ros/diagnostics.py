@@ -19,7 +19,7 @@ from dashcalib_ros.report import NamedCamera
 EVERY_S = 10.0
 # last lines that once() compares with
 REMEMBERED = 100
-# not STALE, which is for aggregators to say of a node that is silent
+# not STALE, which is for aggregators to say about a node that is silent
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
 
@@ -112,7 +112,7 @@ class Health:
 
 def diagnostic(node: Node, what: str, camera_name: str, level: bytes, message: str,
                values: Mapping[str, object]) -> DiagnosticArray:
-    """Return what a node says of a camera, with the present time."""
+    """Return what a node says about a camera, with the present time."""
     return DiagnosticArray(
         header=Header(stamp=node.get_clock().now().to_msg()),
         status=[DiagnosticStatus(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images in, turns learned from them, and what these turns say of the camera in use.
+"""Images in, turns learned from them, and what these turns say about the camera in use.
 
 Both roles, calibrate.py and check.py, are built on it. Every method and callback runs in the
 executor's single thread and is short; what other threads leave with _later() is done in that same
@@ -75,15 +75,15 @@ class Role(Protocol):
         """Take that the turns show other changes of the camera in use than before."""
 
     def health(self) -> Health:
-        """Return what is to be said of the camera in use."""
+        """Return what is to be said about the camera in use."""
 
 
 class Drive:
     """Gives the images to the learner, and compares each turn with the camera in use.
 
     learner: what learns, in the background. images: the subscription. held: why nothing is
-    learned, published and saved now; '' where all is well. monitor: what turns say of the camera
-    in use, None before they do. verdict: of the last calibration.
+    learned, published and saved now; '' where all is well. monitor: what turns say about the
+    camera in use, None before they do. verdict: of the last calibration.
     """
 
     def __init__(self, endpoints: Endpoints, settings: Settings, camera_name: str, role: Role
@@ -100,7 +100,7 @@ class Drive:
         self.monitor: Monitor | None = None
         self.verdict: Verdict | None = None
         # in words: that the camera was moved, as straight stretches show it; and what the car's
-        # own sensors say of the last calibration
+        # own sensors say about the last calibration
         self._moved = ''
         self._witnesses: list[str] = []
         # of fx, of it, by the last calibration; None where it has none

@@ -260,7 +260,7 @@ class Placing:
             self._log.warning(f'{self._file} is of other cameras, or has another base: it is '
                               f'ignored, and overwritten when a rig is accepted')
 
-    # what is said of it ------------------------------------------------------------------------
+    # what is said about it --------------------------------------------------------------------
 
     def _show_transforms(self) -> None:
         """Publish where accepted cameras sit, those that have metres, and a frame of their own."""

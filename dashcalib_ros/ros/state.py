@@ -3,9 +3,9 @@
 
 A car always collects turns, but the published calibration must be stable. After an accepted one a
 new bank of turns is begun, so that each later calibration is independent. A lens wanders: what is
-known of the published one fades with time. A later one that differs from it by no more than chance
-and that confirms it, and it follows by the share of what both know that the new one has. One that
-differs by more contradicts it. Contradictions count from the second turn of a bank on; several in
+known about the published one fades with time. A later one that differs by no more than chance
+confirms it, and it follows by the share of what both know that the new one has. One that differs
+by more contradicts it. Contradictions count from the second turn of a bank on; several in
 a row mean that the camera was moved.
 """
 from __future__ import annotations
@@ -79,7 +79,7 @@ def judge(new: Calibration, complete: bool, published: NamedCamera | None, contr
 
 
 def _now(camera: NamedCamera, days: float, now_c: float | None) -> NamedCamera:
-    """Return what is known of a camera after so many days, at a temperature if that is known."""
+    """Return what is known about a camera after so many days, at a temperature if known."""
     wandered = WANDERS * camera.camera.fx * math.sqrt(min(max(days, 0.0), MOST_DAYS))
     sigma = None if camera.sigma is None else {
         name: math.hypot(value, wandered) if name in ('fx', 'fy') else value
@@ -91,7 +91,7 @@ def _now(camera: NamedCamera, days: float, now_c: float | None) -> NamedCamera:
 def _following(before: NamedCamera, new: Calibration) -> Calibration | None:
     """Return a calibration between the old camera and a new one; None where the old one may stay.
 
-    Each counts by what it knows of fx. What both got wrong alike makes neither better: so the
+    Each counts by what it knows about fx. What both got wrong alike makes neither better: so the
     variance is the mean of both, which holds whatever they have in common.
     """
     old, camera, sigma = before.camera, new.camera, new.sigma

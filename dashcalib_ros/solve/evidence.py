@@ -358,8 +358,8 @@ def drifting(found: Estimate, temperature: Samples | None = None) -> tuple[Drift
     time, unless that explains it clearly better.
 
     And the RMS change over the turns, of fx, that the evidence does not exclude where it is None:
-    a mean over a steady lens and all ways and sizes. Each turn counts by what it knows of fx: the
-    result is not that of one which knows little.
+    a mean over a steady lens and all ways and sizes. Each turn counts by what it knows about fx:
+    one that knows little does not decide.
     """
     own_ns = [scene.tracks.stamps_ns for scene in found.scenes if scene.turn.of_this_drive]
     turns = sorted((int(stamps.min()), int(stamps.max())) for stamps in own_ns)

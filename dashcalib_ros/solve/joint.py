@@ -369,7 +369,7 @@ def _posterior(found: Estimate) -> Posterior:
 def _solution(found: Estimate, unlike: Mapping[TurnId, float], coarse: Profile,
               tried: tuple[Candidate, ...], tests: tuple[FixedCameraTest, ...],
               wanders: float, progress: Progress) -> Solution:
-    """Return the solution with all that is known of it.
+    """Return the solution with all that is known about it.
 
     unlike: each turn's misfit. coarse: the turns' focal profiles. wanders: RMS change of fx during
     the drive that is not excluded, of 1.

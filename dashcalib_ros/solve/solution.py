@@ -90,8 +90,8 @@ class FocalDrift:
 class Solution:
     """All turns adjusted together.
 
-    written: the camera that is written, and the field beside it; posterior: what all turns know of
-    the lens, the readout and the field, in the order of scenes. scenes: as adjusted, as the
+    written: the camera that is written, and the field beside it; posterior: what all turns know
+    about the lens, the readout and the field, in the order of scenes. scenes: as adjusted, as the
     written camera alone would have seen them, in the order given. centred: the camera with one
     focal length that was found first, about which priors and bounds are; bounds: (2, n) lowest and
     highest values that were allowed. coarse: the sum of the turns' focal profiles; around: the
@@ -107,7 +107,7 @@ class Solution:
     those later. unsettled: how far the last step moved the rays over the picture, in their sigma.
     field_sigma: px, of the prior of the field's directions. by_pictures: the solution of the
     pictures alone, where a gyro's angles are in this one; by_turns: the one before what somebody
-    knew of the camera was used. px: of the input's pictures, in one pixel of the scenes.
+    knew about the camera was used. px: of the input's pictures, in one pixel of the scenes.
     """
 
     written: Written
@@ -254,7 +254,7 @@ class LeftOut:
 
 
 def cross_validation(solution: Solution) -> tuple[LeftOut, ...]:
-    """Return what each turn says of the calibration without it; () for fewer than three turns.
+    """Return what each turn says about the calibration without it; () for fewer than three turns.
 
     Neither camera needs a new adjustment. That turns may differ is left out of sigma: it is what
     is asked here.
@@ -277,7 +277,7 @@ def with_measurement(solution: Solution, along: Floats, apart: float, variance: 
     """Return the solution with one more measurement of what turns share, linearised.
 
     along: (m,) its derivatives; apart: what it says, less what the solution says; variance: its
-    own. Only the camera and what is known of it move: the turns stay as they are.
+    own. Only the camera and what is known about it move: the turns stay as they are.
     """
     known = solution.posterior
     # scores are about the optimum, and the solution stands for the mean, which is off it

@@ -67,7 +67,7 @@ def sigma_over(moves: Floats, covariance: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Posterior:
-    """What turns know of what they share: the lens with n parameters, then the rest, m together.
+    """What turns know about what they share: the lens with n parameters, then the rest, m in all.
 
     lens: at the optimum of all turns. alike_in_all: (n, n) covariance of the lens's parameters by
     errors that all turns share: where a field is left that no lens makes, so is what looks like

@@ -3,7 +3,7 @@
 
 A turn was reconstructed with a camera of its own. Here it is brought to a common one, and a focal
 length is held to see how the cost rises around the result. Scenes are given as a lens sees them:
-nothing here knows of shutters and fields.
+nothing here knows about shutters and fields.
 """
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The user's segmentation model: what it is asked, how it adds up, what is said of a bad one."""
+"""The user's segmentation model: what it is given, how it adds up, how a bad one is named."""
 from __future__ import annotations
 
 import itertools

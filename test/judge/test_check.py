@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a drive of made turns says of calibrations that are right and of some that are not."""
+"""What a drive of made turns says about calibrations that are right and of some that are not."""
 from __future__ import annotations
 
 import re

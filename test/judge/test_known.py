@@ -81,7 +81,7 @@ def test_a_known_height_above_the_road_tells_the_focal_length(found):
     assert abs(informed.camera.fx - LENS.fx) < 0.006 * LENS.fx
     assert informed.sigma[0] / LENS.fx == pytest.approx(np.hypot(0.01, 0.01), abs=0.002)
     assert piece.fx_sigma < 0.4 * piece.fx_sigma_without
-    # what the turns say of it stays what they said
+    # what the turns say about it stays what they said
     assert informed.by_turns is short
     assert profile_contrast(informed) == profile_contrast(short)
     [wrong] = with_known(short, knowing(height='2±0.01'), 1.0, above(1.5))[1]

@@ -300,7 +300,7 @@ def test_the_truth_is_compared_where_it_is_known(drawn):
     assert 'Against the truth' in page.text and re.search(r'fx [\d.]+ px -3\.00', page.text)
 
 
-# what is not known of the lens, in a program's hands
+# what is not known about the lens, in a program's hands
 
 def test_sigma_at_pixels_is_about_the_map_s_and_samples_scatter_by_it(drawn):
     found = drawn.material.solution.sigma_map

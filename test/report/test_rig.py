@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page of a rig: what it draws, and what it says of each degree of freedom."""
+"""The page of a rig: what it draws, and what it says about each degree of freedom."""
 from __future__ import annotations
 
 import re

@@ -307,7 +307,7 @@ def test_a_camera_that_is_refused_gets_its_rotation_and_the_others_stand():
     assert left.verdict == 'weak' and codes_of(left) == ['E-RIG-LENS']
     off = rotation_vectors((left.rotation @ CAMERAS['left'].rotation.T)[None])[0]
     assert np.all(np.abs(np.degrees(off)) < 3.5 * np.array(left.rotation_sigma_deg))
-    # where nothing of it could be reconstructed, it is said of whom
+    # where nothing of it could be reconstructed, it is said about whom
     empty = replace(paths['left'], scenes=())
     found = of_paths({**paths, 'left': empty}, {'left': 'refused'})
     assert found.cameras['rear'].verdict == 'accepted'

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Matches of two cameras: what they leave, and what they say of the rotation."""
+"""Matches of two cameras: what they leave, and what they say about the rotation."""
 from __future__ import annotations
 
 import numpy as np

@@ -73,7 +73,7 @@ def test_its_life_with_a_camera_that_is_bumped(make_desk):
     # confirmed, but no better
     desk.give(fx=401.0)
     assert desk.show() == 400.0
-    # clearly better: four times as much is known of fx
+    # clearly better: four times as much is known about fx
     desk.give(fx=402.0, sigma={**SIGMA, 'fx': 1.0})
     followed = desk.show()
     assert followed == pytest.approx(401.6, abs=1e-3)

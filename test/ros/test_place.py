@@ -207,7 +207,7 @@ def test_a_camera_that_is_refused_keeps_no_other_one(made, tmp_path, tf2):
     for name in NAMES:
         store(tmp_path, name, 100, 140)
     assert desk.step() == (OK, 'placed')
-    # what was known of the left one stays
+    # what was known about the left one stays
     now = desk.published[-1]['cameras']
     assert now['left']['rotation_deg'] == desk.published[0]['cameras']['left']['rotation_deg']
     assert now['rear']['verdict'] == 'accepted'

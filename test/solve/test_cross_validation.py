@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What turns say of a calibration that was made without them."""
+"""What turns say about a calibration that was made without them."""
 from __future__ import annotations
 
 from dataclasses import replace

@@ -141,7 +141,7 @@ def test_a_calibration_projects_with_its_field_and_keeps_it(tmp_path):
     told = json.loads(path.read_text())['field']
     assert told['used'] is True
     assert [told[f'{name}_px'] for name in ('rms', 'worst', 'sigma')] == [1.0, 2.5, 0.4]
-    # what the file says of the basis is how the field is read
+    # what the file says about the basis is how the field is read
     x, y = (2 * pixels.T + 1) / np.array(SIZE)[:, None] - 1
     basis = np.polynomial.legendre.Legendre.basis
     terms = [basis(i)(x) * basis(j)(y) for i, j in told['basis']['degrees']]
