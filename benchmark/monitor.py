@@ -8,8 +8,8 @@ Reads the solutions that check.py keeps in the cache. Each turn's tracks are map
 zoomed, cropped, exchanged or turned camera would have seen of them, and explained with the
 calibration in use; these readings are kept in the cache, too. A simulated drive is a row of turns
 of one lens, drawn at random, with a change after some of them. Its calibration in use is the
-solution, moved by an error drawn from the solution's own covariance. The monitor knows the sigma of
-each of its parameters, as in the node.
+solution, moved by an error drawn from the solution's own covariance. The monitor knows the sigmas
+of its parameters, as in the node.
 """
 from __future__ import annotations
 
