@@ -17,7 +17,10 @@ class _Held:
     reported: bool = False
 
     def present(self) -> Turn:
-        return replace(self.turn, prominence=self.peak.prominence)
+        # it grows while the turn is new; afterwards each image asks for the same turn
+        if self.turn.prominence != self.peak.prominence:
+            self.turn = replace(self.turn, prominence=self.peak.prominence)
+        return self.turn
 
     def exchange(self, frames: tuple[Frame, ...]) -> None:
         """Take the same images, stored in another way; none: drop them."""
