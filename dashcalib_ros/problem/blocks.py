@@ -684,6 +684,10 @@ class Imaging:
         """Return whether it counts how poses, and shakes, change the motion of the camera."""
         return abs(self.readout_s) > COUPLED_READOUT_S
 
+    def couples(self, stretch: Stretch) -> bool:
+        """Return whether that counts in a stretch: one of few images does not show its motion."""
+        return self.coupled and stretch.trajectory.moves
+
     @property
     def shared(self) -> list[SharedBlock]:
         """Return the free blocks with one value for all stretches."""
@@ -693,7 +697,7 @@ class Imaging:
     def of_each_image(self, stretch: Stretch) -> list[ImageBlock]:
         """Return the free blocks with a value for each image of a stretch."""
         return [block for block in self.blocks.values() if isinstance(block, ImageBlock)
-                and not block.held and (self.coupled or not block.turns)
+                and not block.held and (not block.turns or self.couples(stretch))
                 and block.within(stretch)]
 
     @property

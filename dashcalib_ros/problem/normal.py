@@ -95,7 +95,7 @@ def linearised(seen: Seen, loss_px: float, safe: bool = False, alone: bool = Fal
     loss: a step to the optimum is shorter, and lowers the cost. alone: what is shared is held.
     """
     stretch, observed, imaging = seen.stretch, seen.observed, seen.imaging
-    coupled = imaging.coupled and stretch.trajectory.moves
+    coupled = imaging.couples(stretch)
     shared = () if alone else imaging.shared
     images = [block for block in imaging.of_each_image(stretch) if not block.turns]
     own = POSE + (MOTION if coupled else 0) + sum(block.count for block in images)

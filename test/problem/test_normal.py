@@ -81,6 +81,20 @@ def test_poses_go_where_they_go_when_what_is_shared_takes_no_step(readout_s):
     assert alone.images.keys() == every.images.keys()
 
 
+def test_images_that_show_no_motion_do_not_shake():
+    """Their shakes stood in the places of what is shared, or beyond the last of them."""
+    turn = synthetic_turn(LENS, 70.0, 2, 30, keyframe_s=0.15)
+    scene = replace(turn.scene(LENS), structure=turn.structure)
+    imaging = imaging_of(LENS, scene, READOUT_S)
+    linear = linearised(imaging.seen(scene), 1.0)
+    assert imaging.coupled and not scene.trajectory.moves and linear.follow is None
+    places = np.concatenate([*linear.extras.values()])
+    assert sorted(places) == [*range(linear.own * len(linear.images))]
+    still = imaging.having(replace(imaging.blocks['shake'], held=True))
+    np.testing.assert_allclose(normal_equations(linear).cost.hessian,
+                               normal_of(scene, still, 1.0).cost.hessian)
+
+
 def as_seen(scene: Scene, imaging: Imaging, noise_px: float = 0.02) -> Scene:
     """Return a turn with its tracks where they are by the imaging, up to noise.
 
