@@ -52,6 +52,11 @@ CENTRE = 0.01
 CHANCE = 1e-3
 # px; a smaller sigma is none
 LEAST_SIGMA_PX = 1e-9
+# of any direction of the parameters, over the picture: what no drive tells apart, px, and of its
+# sigma. Errors of tracks that all turns share move directions that are known to 0.01 px by 0.02,
+# of lenses of 120 degrees by more; without it one true camera of six differed
+# (benchmark/results/check.md)
+ALIKE_PX, ALIKE_SHARE = 0.01, 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,11 +239,21 @@ def difference_of(given: Camera, solution: Solution, px: float) -> Difference:
         alike.params, (0, len(wide.params) - len(alike.params))))
     offsets = solution.seen_by_turns(padded) - found.params
     units = found.units(px)
-    own = found.resized(px, given.image_size)
+    own, sigma_px = found.resized(px, given.image_size), solution.picture.times(px)
     return Difference(
         given, own, offsets * units,
-        solution.covariance * np.outer(units, units), apart(given, own),
-        solution.picture.times(px))
+        _told_apart(own, solution.covariance * np.outer(units, units), sigma_px),
+        apart(given, own), sigma_px)
+
+
+def _told_apart(camera: Camera, covariance: Floats, sigma_px: PictureSigma) -> Floats:
+    """Return a camera's covariance (n, n) with what no drive tells apart."""
+    moves, _ = sensitivity(camera)
+    each = np.einsum('mai,maj->ij', moves, moves) / len(moves)
+    # some parameters hardly move the picture
+    scale = 1 / np.sqrt(np.maximum(np.diag(each), LEAST_SIGMA_PX**2))
+    units = np.linalg.pinv(each * np.outer(scale, scale), hermitian=True) * np.outer(scale, scale)
+    return np.asarray(covariance + (ALIKE_PX**2 + (ALIKE_SHARE * sigma_px.rms)**2) * units)
 
 
 @dataclass(frozen=True)
@@ -308,14 +323,16 @@ def difference_between(given: NamedCamera, found: NamedCamera) -> Difference:
     covariances = [_carried(each.covariance, each.camera, base.camera)
                    for each in (given, found) if each.covariance is not None]
     sigmas = [each.sigma_px for each in (given, found) if each.sigma_px is not None]
+    sigma_px = PictureSigma(
+        float(np.hypot.reduce([each.rms for each in sigmas])),
+        float(np.hypot.reduce([each.worst for each in sigmas]))) if sigmas else None
     return Difference(
         given.camera, found.camera, a.params - b.params,
-        np.sum(covariances, axis=0) if covariances else None,
+        _told_apart(base.camera, np.sum(covariances, axis=0), sigma_px)
+        if covariances and sigma_px is not None else None,
         apart(given.camera, found.camera,
               None if given.field is None else given.field.observed,
-              None if found.field is None else found.field.ideal),
-        PictureSigma(float(np.hypot.reduce([each.rms for each in sigmas])),
-                     float(np.hypot.reduce([each.worst for each in sigmas]))) if sigmas else None)
+              None if found.field is None else found.field.ideal), sigma_px)
 
 
 def _carried(covariance: Floats, camera: Camera, to: Camera) -> Floats:

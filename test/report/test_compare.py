@@ -49,6 +49,17 @@ def shifted(**changes):
     return NamedCamera('moved', dataclasses.replace(TRUTH, **moved))
 
 
+@pytest.mark.parametrize(('k1', 'apart'), [(1e-4, False), (2e-3, True)])
+def test_what_no_drive_tells_apart_is_no_difference(k1, apart):
+    """However well the turns say that they determine some direction."""
+    other = shifted(k1=k1)
+    sure = NamedCamera('sure', TRUTH, covariance=1e-16 * np.eye(6),
+                       sigma_px=PictureSigma(0.01, 0.02))
+    found = compare(other, sure).whole
+    assert (found.rms_px > 0.05) == apart and found.told_apart == apart
+    assert found.answer == ('differs' if apart else 'right')
+
+
 def scoring_tool(estimate, truth):
     """Compute the mapping error the scoring tool's way: point by point, fixed-point rays."""
     def bend(c, x, y):
