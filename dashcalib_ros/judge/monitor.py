@@ -367,10 +367,14 @@ class Monitor:
         return found
 
     def _headings(self, readings: Sequence[Reading]) -> tuple[Floats, Floats]:
-        angles = np.array([[each.heading.yaw_deg, each.heading.pitch_deg] for each in readings
-                           if each.heading is not None])
-        varies = np.array([HEADING_SIGMA_DEG, PITCH_SIGMA_DEG])
-        return angles.mean(axis=0), np.square(varies) / len(angles)
+        """Return the mean yaw and pitch of readings, (2,), and its variances; degrees."""
+        known = [each.heading for each in readings if each.heading is not None]
+        angles = np.array([[each.yaw_deg, each.pitch_deg] for each in known])
+        own = np.array([[each.yaw_sigma_deg, each.pitch_sigma_deg] for each in known])
+        # what turns differ by contains the noise of those that show it well
+        weights = np.maximum([HEADING_SIGMA_DEG, PITCH_SIGMA_DEG], own)**-2
+        total = weights.sum(axis=0)
+        return (weights * angles).sum(axis=0) / total, 1 / total
 
 
 def watch(readings: Iterable[Reading], camera: Camera, sigma: Mapping[str, float] | None,

@@ -204,6 +204,14 @@ def test_a_camera_that_is_moved_on_the_car_is_told_and_its_calibration_stays():
     assert '1.1 degrees to the left' in str(change) and 'stays right' in str(change)
 
 
+@pytest.mark.parametrize(('sigma_deg', 'moved'), [(0.05, True), (0.3, False)])
+def test_a_heading_counts_by_its_own_sigma(sigma_deg, moved):
+    """KITTI 03 has turns of 17 degrees whose headings are known to 0.3 degrees."""
+    before = [looking(0.0, 0.0, n) for n in range(3)]
+    after = [looking(0.7, 0.0, n, sigma_deg) for n in (3, 4)]
+    assert bool(watched([*before, *after]).changes) == moved
+
+
 def test_headings_that_are_not_known_well_do_not_count():
     before = [looking(0.0, 0.0, n) for n in range(4)]
     assert watched([*before, *(looking(5.0, 0.0, n, 2.0) for n in (4, 5))]).changes == ()
