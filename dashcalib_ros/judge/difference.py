@@ -52,11 +52,10 @@ CENTRE = 0.01
 CHANCE = 1e-3
 # px; a smaller sigma is none
 LEAST_SIGMA_PX = 1e-9
-# of any direction of the parameters, over the picture: what no drive tells apart, px, and of its
-# sigma. Errors of tracks that all turns share move directions that are known to 0.01 px by 0.02,
-# of lenses of 120 degrees by more; without it one true camera of six differed
-# (benchmark/results/check.md)
-ALIKE_PX, ALIKE_SHARE = 0.01, 0.03
+# no direction of the parameters is known better over the picture: px, and of its sigma. Errors of
+# tracks that all turns share move directions that seem known to 0.01 px by 0.02, with lenses of
+# 120 degrees by more; without this floor four of 26 true cameras of check.py differed
+FLOOR_PX, FLOOR_SHARE = 0.01, 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,18 +241,18 @@ def difference_of(given: Camera, solution: Solution, px: float) -> Difference:
     own, sigma_px = found.resized(px, given.image_size), solution.picture.times(px)
     return Difference(
         given, own, offsets * units,
-        _told_apart(own, solution.covariance * np.outer(units, units), sigma_px),
+        _with_floor(own, solution.covariance * np.outer(units, units), sigma_px),
         apart(given, own), sigma_px)
 
 
-def _told_apart(camera: Camera, covariance: Floats, sigma_px: PictureSigma) -> Floats:
-    """Return a camera's covariance (n, n) with what no drive tells apart."""
+def _with_floor(camera: Camera, covariance: Floats, sigma_px: PictureSigma) -> Floats:
+    """Return a camera's covariance (n, n) with the least variance of each direction added."""
     moves, _ = sensitivity(camera)
     each = np.einsum('mai,maj->ij', moves, moves) / len(moves)
     # some parameters hardly move the picture
     scale = 1 / np.sqrt(np.maximum(np.diag(each), LEAST_SIGMA_PX**2))
     units = np.linalg.pinv(each * np.outer(scale, scale), hermitian=True) * np.outer(scale, scale)
-    return np.asarray(covariance + (ALIKE_PX**2 + (ALIKE_SHARE * sigma_px.rms)**2) * units)
+    return np.asarray(covariance + (FLOOR_PX**2 + (FLOOR_SHARE * sigma_px.rms)**2) * units)
 
 
 @dataclass(frozen=True)
@@ -328,7 +327,7 @@ def difference_between(given: NamedCamera, found: NamedCamera) -> Difference:
         float(np.hypot.reduce([each.worst for each in sigmas]))) if sigmas else None
     return Difference(
         given.camera, found.camera, a.params - b.params,
-        _told_apart(base.camera, np.sum(covariances, axis=0), sigma_px)
+        _with_floor(base.camera, np.sum(covariances, axis=0), sigma_px)
         if covariances and sigma_px is not None else None,
         apart(given.camera, found.camera,
               None if given.field is None else given.field.observed,

@@ -34,7 +34,8 @@ USUAL_SPEED = 8.0
 # weight of a step's direction beside that of its turning, rad
 DIRECTION = 0.02
 
-# one sigma of a speed, and of the metres of a stretch that has no straight part
+# in one stretch: one sigma of a speed beyond that of its scale, which all share, and of the metres
+# where no part is straight
 SPEED_SIGMA, BENT_SIGMA = 0.01, 0.02
 # of a path's largest bend, below which it is straight: in a bend a camera is faster than a wheel
 UNBENT = 0.3
