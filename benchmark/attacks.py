@@ -527,7 +527,7 @@ def attacked(attack: str, film: str, seed: int, data: Path | None, cache: Path) 
     known = KNOWN.get(film)
     row = (summarised(result, changed.truth) if known is None
            else summarised(result, changed.truth, known))
-    said = ' '.join((*result.verdict.reasons, *result.warnings)).lower()
+    said = ' '.join(map(str, (*result.verdict.reasons, *result.warnings))).lower()
     return {**row, 'seconds': seconds,
             'named': any(word in said for word in BY_ATTACK[attack].words)}
 

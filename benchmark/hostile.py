@@ -65,7 +65,7 @@ from std_srvs.srv import Trigger
 from dashcalib_ros import Calibrator
 from dashcalib_ros.camera import Radial, ros_camera
 from dashcalib_ros.demo import Drive, DriveSpec, Lens
-from dashcalib_ros.errors import DashcalibError
+from dashcalib_ros.errors import DashcalibError, Notice
 from dashcalib_ros.formats import load_camera
 from dashcalib_ros.formats.ros import camera_of_message
 from dashcalib_ros.input import Frame
@@ -397,7 +397,7 @@ def stores(folder: Path, tries: Sequence[int]) -> Iterator[None]:
     origin = Origin((800, 450), Scale(), 'camera')
     turns = clip_of(yaws=YAWS[:2], tracks=60, keyframes=8).turns
     for n in tries:
-        said: list[str] = []
+        said: list[Notice] = []
         store = TurnStore(str(folder / str(n)), 10, 3.0, said.append)
         store.load(origin)
         store.mirror({TurnId.at(100 + k): turn for k, turn in enumerate(turns)})
@@ -827,7 +827,7 @@ def two_cameras(_: Path, tries: Sequence[int]) -> Iterator[None]:
                 calibrator.push(Frame(number, round(number * 1e9 / rate),
                                       other(image) if is_other else image))
             found = calibrator.calibrate()
-        told = any('two cameras' in reason for reason in found.verdict.reasons)
+        told = any('two cameras' in str(reason) for reason in found.verdict.reasons)
         assert (found.verdict.level, told) == (
             ('accepted', False) if n < sound else ('refused', True)), found.verdict
         yield

@@ -365,7 +365,7 @@ def measured(path: Path) -> dict[str, Any]:
 
 def named(found: CalibrationData) -> list[str]:
     """Return which effects the result names."""
-    text = ' '.join((*found.verdict.reasons, *found.warnings))
+    text = ' '.join(map(str, (*found.verdict.reasons, *found.warnings)))
     return [name for name, is_named in (
         ('zoom', 'the zoom changes' in text),
         ('stabilised', found.stabiliser is not None or 'stabil' in text),

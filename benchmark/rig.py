@@ -126,7 +126,7 @@ def measured(drives: dict[str, Any], **options: Any) -> tuple[RigCalibration, st
 
 def unplaced(start: str, camera: PlacedCamera, cost: str) -> str:
     """Return the row of a camera without a place."""
-    return f'{start} {camera.verdict} | {"; ".join(camera.reasons)} | | | | | {cost}'
+    return f'{start} {camera.verdict} | {"; ".join(map(str, camera.reasons))} | | | | | {cost}'
 
 
 def rotated(start: str, camera: PlacedCamera, truth: np.ndarray) -> str:

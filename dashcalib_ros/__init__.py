@@ -13,6 +13,7 @@ if TYPE_CHECKING:
         DashcalibError,
         InputError,
         NotAcceptedError,
+        Notice,
         OutputError,
         WorkerError,
     )
@@ -35,10 +36,10 @@ if TYPE_CHECKING:
 
 __all__ = ['AcceptedCalibration', 'Brown', 'Calibration', 'Calibrator', 'Camera', 'Check',
            'Comparison', 'Config', 'ConfigError', 'DashcalibError', 'Fisheye', 'Frame',
-           'InputError', 'NamedCamera', 'NotAcceptedError', 'OutputError', 'Radial', 'Rational',
-           'RigCalibration', 'SensorStream', 'Status', 'Verdict', 'WorkerError', '__version__',
-           'calibrate', 'calibrate_rig', 'check', 'compare', 'export', 'load_camera', 'load_rig',
-           'open_frames']
+           'InputError', 'NamedCamera', 'NotAcceptedError', 'Notice', 'OutputError', 'Radial',
+           'Rational', 'RigCalibration', 'SensorStream', 'Status', 'Verdict', 'WorkerError',
+           '__version__', 'calibrate', 'calibrate_rig', 'check', 'compare', 'export',
+           'load_camera', 'load_rig', 'open_frames']
 
 _HOMES = {'Calibrator': 'pipeline', 'Check': 'judge', 'Comparison': 'report.compare',
           'Config': 'config', 'Frame': 'input', 'calibrate': 'session', 'check': 'session',
@@ -49,7 +50,7 @@ _HOMES = {'Calibrator': 'pipeline', 'Check': 'judge', 'Comparison': 'report.comp
                            'compare'), 'report'),
           **dict.fromkeys(('Brown', 'Camera', 'Fisheye', 'Radial', 'Rational'), 'camera'),
           **dict.fromkeys(('ConfigError', 'DashcalibError', 'InputError', 'NotAcceptedError',
-                           'OutputError', 'WorkerError'), 'errors')}
+                           'Notice', 'OutputError', 'WorkerError'), 'errors')}
 
 
 def __dir__() -> list[str]:

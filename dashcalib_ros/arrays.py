@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from dashcalib_ros.errors import Notice
+
 Floats = npt.NDArray[np.float64]
 Floats32 = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int64]
@@ -25,8 +27,8 @@ def plain_values(value: Any) -> Any:
     """Return the value as types of strict JSON; NaN and infinity become None."""
     if value is None or isinstance(value, bool):
         return value
-    if isinstance(value, str):
-        return str(value)  # YAML has no place for a Notice
+    if isinstance(value, (str, Notice)):
+        return str(value)
     if isinstance(value, (np.ndarray, np.generic)):
         return plain_values(value.tolist())
     if isinstance(value, int):

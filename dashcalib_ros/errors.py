@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TypeVar
 
 T = TypeVar('T')
@@ -26,9 +27,10 @@ def one_line(error: BaseException, limit: int = 160) -> str:
     return shortened(' '.join(str(error).split()) or type(error).__name__, limit)
 
 
-def coded(message: Exception | str, limit: int = 1000) -> str:
+def coded(message: Exception | Notice | str, limit: int = 1000) -> str:
     """Return a message on one line, with its code at the end if it has one."""
-    text = shortened(message, limit) if isinstance(message, str) else one_line(message, limit)
+    text = (one_line(message, limit) if isinstance(message, Exception) else
+            shortened(str(message), limit))
     code = code_of(message)
     return text + (f' [{code}]' if code else '')
 
@@ -53,25 +55,20 @@ def spared(what: str, lost: list[Notice], make: Callable[..., T], *arguments: ob
         return None
 
 
-class Notice(str):
+@dataclass(frozen=True)
+class Notice:
     """A warning, or another line for the user that is not an error, with a code as errors have it.
 
-    It is a string, 'what: remedy', for people. The code is for scripts, and stays when the text
-    is reworded.
+    what, remedy: parts of one line for people, which is str(notice). The code is for scripts, and
+    stays when the text is reworded.
     """
 
     code: str
     what: str
-    remedy: str
+    remedy: str = ''
 
-    def __new__(cls, code: str, what: str, remedy: str = '') -> Notice:
-        """code: such as E-RATE-ASSUMED, or that of an error. what, remedy: parts of one line."""
-        notice = super().__new__(cls, f'{what}: {remedy}' if remedy else what)
-        notice.code, notice.what, notice.remedy = code, what, remedy
-        return notice
-
-    def __getnewargs__(self) -> tuple[str, str, str]:  # type: ignore[override]
-        return self.code, self.what, self.remedy
+    def __str__(self) -> str:
+        return f'{self.what}: {self.remedy}' if self.remedy else self.what
 
 
 def shortened(text: str, limit: int = 160) -> str:

@@ -460,7 +460,7 @@ def test_stored_turns_of_another_size_are_left_out_and_told(tmp_path):
     with Calibrator(config, warn=told.append) as calibrator:
         assert calibrator.push(pictures(1, 320, 180)[0]).turns == 0
         result = calibrator.calibrate()
-    assert len(told) == 1 and result.warnings == tuple(told) and '640x360' in told[0]
+    assert len(told) == 1 and result.warnings == tuple(told) and '640x360' in str(told[0])
     assert result.warnings[0].code == 'E-STORE-OTHER-CAMERA'
     assert result.stored_turns == () and len(list(tmp_path.iterdir())) == 1
     # of this size they count as turns, until they are forgotten
@@ -648,7 +648,7 @@ def refusal(frames: Iterable[Frame]) -> tuple[str, ...]:
     calibration = calibrated(frames)
     assert calibration.verdict.level == 'refused'
     assert calibration.intrinsics is None and calibration.sigma is None
-    assert calibration.verdict.reasons and '\n' not in ''.join(calibration.verdict.reasons)
+    assert calibration.verdict.reasons and '\n' not in calibration.verdict.main_text
     return calibration.verdict.codes
 
 

@@ -320,7 +320,7 @@ def test_accepted_returns_the_same_result_or_raises_with_the_reasons():
         with pytest.raises(NotAcceptedError) as error:
             other.accepted()
         assert error.value.code == 'E-NOT-ACCEPTED' and level in str(error.value)
-        assert all(reason in str(error.value) for reason in other.verdict.reasons)
+        assert all(str(reason) in str(error.value) for reason in other.verdict.reasons)
 
 
 @pytest.mark.thorough

@@ -23,7 +23,7 @@ ALLOWED: dict[str, set[str]] = {
     'config': {'errors'},
     'errors': set(),
     'limits': {'errors'},
-    'arrays': set(),
+    'arrays': {'errors'},
     'robust': {'arrays'},
     'whole_files': set(),
     '__init__': {'pipeline', 'camera', 'input', 'judge', 'formats', 'report', 'selection',

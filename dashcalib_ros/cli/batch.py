@@ -81,7 +81,8 @@ def _engine(args: argparse.Namespace, config: Config) -> Engine:
 
 def _summarise(cameras: Sequence[Camera], screen: Screen) -> int:
     found = list(problems(cameras))
-    warn(_problem(row, why) for row, why in found[:SHOWN])
+    for row, why in found[:SHOWN]:
+        write_stderr(f'dashcalib: warning: {_problem(row, why)}')
     if len(found) > SHOWN:
         warn([Notice('E-CLIPS-UNREADABLE', f'{len(found) - SHOWN} more clips could not be read; '
                      f'the table of clips lists them')])

@@ -94,7 +94,7 @@ def _poses(args: argparse.Namespace) -> tuple[Poses | None, SensorStream | None]
         return read_poses(path), None
     track = bag_motion([path], {'gps': args.gps}, args.topic) if is_bag else read_motion(path)
     if track is None or track.position is None:
-        why = '; '.join(() if track is None else track.warnings)
+        why = '; '.join(() if track is None else map(str, track.warnings))
         raise InputError('E-NO-GPS-TRACK',
                          f'{path} has no GPS track{why and f" ({why})"}: use one with positions '
                          f'(NavSatFix, GPX), or poses in the format of KITTI, TUM or EuRoC')

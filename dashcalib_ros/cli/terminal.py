@@ -77,11 +77,11 @@ class Screen:
             warn([Notice(error.code, str(error))])
 
 
-def warn(lines: Iterable[str]) -> None:
-    """Print warnings on stderr, one line each, that of a Notice with its code at the end."""
-    for line in lines:
-        code = f' [{line.code}]' if isinstance(line, Notice) and line.code else ''
-        write_stderr(f'dashcalib: warning: {" ".join(line.split())}{code}')
+def warn(notices: Iterable[Notice]) -> None:
+    """Print warnings on stderr, one line each with its code at the end."""
+    for notice in notices:
+        code = f' [{notice.code}]' if notice.code else ''
+        write_stderr(f'dashcalib: warning: {" ".join(str(notice).split())}{code}')
 
 
 class MovingBar(BarColumn):

@@ -74,7 +74,7 @@ class ClipResult:
     again: bool = False
 
     @classmethod
-    def without(cls, why: Exception | str, stamp: str = '') -> ClipResult:
+    def without(cls, why: Exception | Notice, stamp: str = '') -> ClipResult:
         """Return the result of a clip that gives no turns."""
         return cls(coded(why, LONGEST), code_of(why), stamp)
 
@@ -263,7 +263,7 @@ def gather(path: Path, content: str, fps: float | None, topic: str | None, confi
     found = sorted([*turns, *stretches], key=lambda turn: turn.scene.turn.number)
     assert detection.size is not None
     # the same content gives the same, wherever it lies
-    warnings = tuple(line.replace(str(path), 'the clip')
+    warnings = tuple(str(line).replace(str(path), 'the clip')
                      for line in (*source.warnings, *detection.warnings()))
     return SceneFile(Origin(detection.size, detection.scale), tuple(found),
                      len(best) + len(stretches), content,

@@ -206,7 +206,7 @@ def _verdict(own: CalibrationData, camera_model: str, camera: Camera, covariance
         f'turns; sigma of fx with it: {sigma:.1f} %')
     return Verdict('weak', (why, *(
         Notice(each.code, f'without the prior: {each}') for each in own.verdict.reasons)),
-        (Condition(why.code, why, '', '', False), *own.verdict.conditions))
+        (Condition(why.code, str(why), '', '', False), *own.verdict.conditions))
 
 
 def _picture_sigma(camera: Camera, covariance: Floats, alone: PictureSigma) -> PictureSigma:

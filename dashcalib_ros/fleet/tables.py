@@ -74,8 +74,8 @@ def camera_row(solved: Solved, final: Final, clips: Sequence[Mapping[str, Any]])
         'width': c.image_size[0] or None, 'height': c.image_size[1] or None,
         'reprojection_error_px': c.reprojection_error_px, 'prior_units': final.prior_units,
         'prior_share': final.prior_share, 'prior_note': final.prior_note,
-        'other_mode': final.other_mode, 'reasons': list(c.verdict.reasons),
-        'reason_codes': list(c.verdict.codes), 'warnings': list(c.warnings)}
+        'other_mode': final.other_mode, 'reasons': [*map(str, c.verdict.reasons)],
+        'reason_codes': list(c.verdict.codes), 'warnings': [*map(str, c.warnings)]}
     if estimate is not None:
         row.update({f'sigma_{name}_alone': sigma for name, sigma in estimate.sigma.items()})
     if c.camera is not None and c.sigma is not None:

@@ -24,7 +24,7 @@ from dashcalib_ros.camera.field import TERMS as FIELD_TERMS
 from dashcalib_ros.camera.other import OtherLens
 from dashcalib_ros.config import RENAMED, Config
 from dashcalib_ros.detect import Bend, TurnId
-from dashcalib_ros.errors import DashcalibError, InputError, Notice, code_of, one_line
+from dashcalib_ros.errors import DashcalibError, InputError, Notice, one_line
 from dashcalib_ros.formats import opencv, ros
 from dashcalib_ros.formats.plausible import check_lens
 from dashcalib_ros.formats.values import (
@@ -204,9 +204,9 @@ def _held_out_dict(turn: LeftOut) -> dict[str, Any]:
             'others_sigma_px': turn.others_sigma_px}
 
 
-def codes_of(lines: Iterable[str]) -> list[str]:
-    """Return the codes of warnings or reasons; '' for a line that is no Notice."""
-    return [*map(code_of, lines)]
+def codes_of(notices: Iterable[Notice]) -> list[str]:
+    """Return the codes of warnings or reasons."""
+    return [notice.code for notice in notices]
 
 
 def _notices(data: Any, texts: str, codes: str) -> tuple[Notice, ...]:

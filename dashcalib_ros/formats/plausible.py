@@ -68,7 +68,7 @@ def check_lens(camera: Camera, path: object) -> None:
     if unseen > MOST_UNSEEN or angles < LEAST_ANGLES:
         size = _size_doubt(camera, path)
         if size:
-            raise InputError(size[0].code, size[0])
+            raise InputError(size[0].code, str(size[0]))
         what = (f'the picture folds {near:.0f} px from its centre, and {100 * unseen:.0f} % of it '
                 f'has no ray' if unseen > MOST_UNSEEN else
                 f'it shows {100 * angles:.0f} % of the angle without')

@@ -36,7 +36,8 @@ def write(found: NamedCamera) -> str:
     """
     mount, name = mount_of(found), _frame_name(found.name)
     about = [
-        f'{found.name}: how the camera sits on the car, {mount.verdict}', *mount.reasons,
+        f'{found.name}: how the camera sits on the car, {mount.verdict}',
+        *map(str, mount.reasons),
         *(f'{what}: {_with_sigma(mount, key)}' for key, what in WRITTEN.items()),
         f'x and y are not known: {BASE} is on the road below the camera until you set them']
     return _robot(name, about, BASE, [

@@ -62,7 +62,7 @@ if sys.version_info >= (3, 14):
 else:
     from backports import zstd
 
-Damage = Callable[[str], None]
+Damage = Callable[[Notice], None]
 # bytes of a file that are unpacked at once
 PIECE = 2**20
 # of the head of a record of a ROS 1 bag's index
@@ -273,13 +273,13 @@ def unpacked(file: Path, damage: Damage) -> Iterator[Path]:
                 _unpack_file(file, plain)
             else:
                 _complete(file, journals, plain)
-                damage(f'{file.name} was not closed; its last messages are read from '
-                       f'{first_of([each.name for each in journals])}')
+                damage(_because(f'{file.name} was not closed; its last messages are read from '
+                                f'{first_of([each.name for each in journals])}'))
         except (zstd.ZstdError, EOFError):
-            damage(f'{file.name} is damaged')
+            damage(_because(f'{file.name} is damaged'))
         except apsw.Error as error:
-            damage(f'{file.name} was not closed, and {journals[0].name} with its last messages '
-                   f'cannot be used ({one_line(error)})')
+            damage(_because(f'{file.name} was not closed, and {journals[0].name} with its last '
+                            f'messages cannot be used ({one_line(error)})'))
             plain = file
         except OSError as error:
             if error.errno not in (errno.ENOSPC, errno.EDQUOT):
@@ -527,13 +527,15 @@ def has_other_encodings(path: Path) -> bool:
                    for each in _summary(file, min(path.stat().st_size, RECORD_BYTES)))
 
 
-def _with_code(damage: str, error: Exception) -> str:
-    return Notice(error.code, damage) if isinstance(error, InputError | TooMuchError) else damage
+def _because(damage: str, error: Exception | None = None) -> Notice:
+    if isinstance(error, InputError | TooMuchError):
+        return Notice(error.code, damage)
+    return Notice('E-BAG-DAMAGED', damage)
 
 
-def refuse(damage: str) -> None:
+def refuse(damage: Notice) -> None:
     """Raise InputError for what is damaged."""
-    raise InputError('E-BAG-DAMAGED', damage)
+    raise InputError('E-BAG-DAMAGED', str(damage))
 
 
 class _Place(NamedTuple):
@@ -635,8 +637,8 @@ class McapFile:
         if place < end:
             later = [chunk for chunk in sorted(indexed) if place < chunk.place < chunk.end <= end]
             self._chunks += later
-            self._damage(f'{self._path.name} is {"damaged" if later else "truncated"} at byte '
-                         f'{place}')
+            self._damage(_because(f'{self._path.name} is {"damaged" if later else "truncated"} at '
+                                  f'byte {place}'))
         about = self._statistics
         if self._chunks and (about is None or len(self._channels) < about.channel_count or any(
                 each.schema_id and each.schema_id not in self._schemas
@@ -720,7 +722,7 @@ class McapFile:
         try:
             found = [each for each in self._records_in(chunk) if isinstance(each, Message)]
         except Exception as error:  # also the unpackers' own errors
-            self._damage(_with_code(
+            self._damage(_because(
                 f'{self._path.name} has a damaged chunk ({one_line(error)})', error))
             return []
         return sorted(found, key=lambda each: each.log_time)
@@ -787,7 +789,7 @@ def scan_db3(path: Path, damage: Damage) -> Iterator[Record]:
                 rows.append(row)
                 times.append(receive_ns)
         except apsw.Error as error:
-            damage(f'{path.name}: {one_line(error)}')
+            damage(_because(f'{path.name}: {one_line(error)}'))
         for n in np.argsort(times, kind='stable'):
             for topic, data in database.execute(_ROW, (rows[n], left)):
                 left -= len(data)
@@ -796,7 +798,7 @@ def scan_db3(path: Path, damage: Damage) -> Iterator[Record]:
                 if topic in topics:
                     yield Record(*topics[topic], times[n], data)
     except apsw.Error as error:
-        damage(_with_code(f'{path.name}: {one_line(error)}', error))
+        damage(_because(f'{path.name}: {one_line(error)}', error))
     finally:
         database.close()
 
@@ -808,7 +810,7 @@ def scan_bag(path: Path, damage: Damage) -> Iterator[Record]:
         try:
             yield from _bag_messages(file, {}, _Unpacking(path))
         except Exception as error:  # rosbags' errors, and those of what unpacks
-            damage(_with_code(f'{path.name} is truncated ({one_line(error)})', error))
+            damage(_because(f'{path.name} is truncated ({one_line(error)})', error))
 
 
 def _bag_messages(file: BufferedReader, connections: dict[int, tuple[str, str]],

@@ -19,7 +19,7 @@ from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
 from dashcalib_ros.arrays import Pixels
-from dashcalib_ros.errors import InputError, Notice, code_of, counted
+from dashcalib_ros.errors import InputError, Notice, counted
 from dashcalib_ros.input.bag_read import (
     Damage,
     Record,
@@ -139,7 +139,7 @@ def open_bag(path: Path) -> Bag:
             'E-BAG-NO-METADATA', f'{path} has no usable metadata.yaml: its files are read in the '
             f'order {first_of([file.name for file in files])}')]
     if not files:
-        why = f' ({"; ".join(warnings)})' if warnings else ''
+        why = f' ({"; ".join(map(str, warnings))})' if warnings else ''
         raise InputError('E-BAG-NO-FILES',
                          f'{path} has no .mcap, .db3 or .bag file{why}: copy the '
                          f'whole folder')
@@ -182,15 +182,15 @@ def _typed(topics: tuple[Topic, ...], others: tuple[Topic, ...]) -> tuple[Topic,
 def _topics_of(files: tuple[Path, ...], bag: Path) -> tuple[tuple[Topic, ...], bool]:
     """Return all topics, and whether they are from the indices of all files."""
     counts = Counter[tuple[str, str]]()
-    problems: list[str] = []
+    problems: list[Notice] = []
     indexed = True
     for file in files:
         found, by_index = message_counts(file, problems.append)
         counts.update(found)
         indexed &= by_index
     if problems and not counts:
-        why = first_of(problems, LISTED)
-        if all(code_of(each) in NO_RECORDING for each in problems):
+        why = first_of([*map(str, problems)], LISTED)
+        if all(each.code in NO_RECORDING for each in problems):
             raise InputError('E-BAG-NOT-A-RECORDING', f'{bag} cannot be read ({why}): {NO_CURE}')
         raise InputError('E-BAG-DAMAGED', f'{bag} cannot be read ({why}): {REMEDY}')
     return _sorted(counts), indexed
@@ -253,7 +253,7 @@ class BagSource(FrameSource):
 
     def _pictures(self, reading: Reading, start_ns: int = 0) -> Generator[Picture, None, None]:
         gate = StampGate()
-        damage: list[str] = []
+        damage: list[Notice] = []
         first_ns: int | None = None
         try:
             for shot in self._shots(reading, damage):
@@ -267,7 +267,7 @@ class BagSource(FrameSource):
         finally:
             reading.warnings += gate.warnings()
 
-    def _shots(self, reading: Reading, damage: list[str]) -> Iterator[_Shot]:
+    def _shots(self, reading: Reading, damage: list[Notice]) -> Iterator[_Shot]:
         """Yield the images in the order in which they are shown; a video has packets for them."""
         depth, packets = BitDepth(), PacketDecoder()
         for record in self._bag.records([str(self.topic)], damage.append):
@@ -289,11 +289,11 @@ class BagSource(FrameSource):
                 'E-VIDEO-BEGINS-LATE', f'the first {packets.waited} images of the video are '
                 f'skipped: the key picture that they depend on is missing before them'))
 
-    def _losses(self, read: int, damage: list[str]) -> list[Notice]:
+    def _losses(self, read: int, damage: list[Notice]) -> list[Notice]:
         lost = (self._promised or 0) - read if self._bag.indexed else 0
         if not damage and lost <= 0:
             return []
-        why = (f'damaged or was not closed ({"; ".join(damage[:2])}'
+        why = (f'damaged or was not closed ({"; ".join(map(str, damage[:2]))}'
                f'{" ..." if len(damage) > 2 else ""})' if damage else 'incomplete')
         return [Notice('E-BAG-IMAGES-LOST', f'the bag is {why}: {read}' + (
             ' images were read, the number of lost images is unknown' if not self._bag.indexed else

@@ -562,8 +562,9 @@ def _together(by_part: Sequence[tuple[str, Sequence[Notice]]]) -> tuple[Notice, 
     counts: Counter[str] = Counter()
     for name, warnings in by_part:
         for warning in warnings:
-            words = warning.replace(name, '')
-            first.setdefault(words, warning if name in warning
+            text = str(warning)
+            words = text.replace(name, '')
+            first.setdefault(words, warning if name in text
                              else Notice(warning.code, f'{name}: {warning}'))
             counts[words] += 1
     return tuple(line if counts[words] == 1 else

@@ -353,7 +353,7 @@ class FrameSource(ABC):
         # what is wrong with an image has a remedy of its own
         if failure := reading.first_failure:
             return InputError(failure.code, f'{self.name} has no readable image ({failure})')
-        why = '; '.join(reading.warnings)
+        why = '; '.join(map(str, reading.warnings))
         return InputError('E-INPUT-NO-IMAGES', f'{self.name} has no readable image'
                           f'{f" ({why})" if why else ""}: {self._remedy}')
 

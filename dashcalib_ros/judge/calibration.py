@@ -84,6 +84,11 @@ class Verdict:
         """Return the reasons to show: of a refused result the first, as the others follow."""
         return self.reasons[:1] if self.level == 'refused' else self.reasons
 
+    @property
+    def main_text(self) -> str:
+        """Return the main reasons in one line."""
+        return '; '.join(map(str, self.main_reasons))
+
 
 @dataclass(frozen=True)
 class TurnSummary:
@@ -461,7 +466,7 @@ class CalibrationData:
     def __repr__(self) -> str:
         """Return one line: the verdict, the parameters with their sigmas, or the first reason."""
         if self.camera is None:
-            return f'Calibration({self.verdict.level}: {"; ".join(self.verdict.main_reasons)})'
+            return f'Calibration({self.verdict.level}: {self.verdict.main_text})'
         sigma = self.sigma or {}
         found = [f'{name} {_with_sigma(value, sigma.get(name, math.nan))}'
                  for name, value in self.camera.named.items()]
@@ -592,7 +597,7 @@ class CalibrationData:
     def _camera(self) -> Camera:
         if self.camera is None:
             raise InputError('E-CALIBRATION-REFUSED', 'the calibration was refused: '
-                             f'{"; ".join(self.verdict.main_reasons)}')
+                             f'{self.verdict.main_text}')
         return self.camera
 
     @property

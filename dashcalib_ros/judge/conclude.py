@@ -286,10 +286,11 @@ def _part(part: Solution | None, whole: Solution, later: int, evidence: Evidence
     else:
         part = replace(part, px=whole.px)
         verdict = judge(part, config.verdict)
+    reasons = tuple(map(str, verdict.reasons))
     if part is None or verdict.level == 'refused':
-        return Part(from_s, to_s, verdict.level, verdict.reasons, verdict.codes, None, None, None)
+        return Part(from_s, to_s, verdict.level, reasons, verdict.codes, None, None, None)
     full, sigma = _in_input(part.camera, part.sigma, part.px, evidence.image_size)
-    return Part(from_s, to_s, verdict.level, verdict.reasons, verdict.codes, full.model,
+    return Part(from_s, to_s, verdict.level, reasons, verdict.codes, full.model,
                 full.named, sigma, part.picture.times(part.px))
 
 

@@ -52,8 +52,8 @@ class Calibration(CalibrationData):  # noqa: D101, it is the base's, which has t
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: the verdict with its reasons, and the parameters."""
-        return notebook_html(self.verdict.level, (*self.verdict.main_reasons, self.caveat),
-                             PARAMETERS, parameter_rows(self))
+        return notebook_html(self.verdict.level, [
+            *map(str, self.verdict.main_reasons), self.caveat], PARAMETERS, parameter_rows(self))
 
     def accepted(self) -> AcceptedCalibration:
         """Return the same calibration, whose camera and sigma are known not to be None.
@@ -62,7 +62,7 @@ class Calibration(CalibrationData):  # noqa: D101, it is the base's, which has t
         """
         if self.verdict.level != 'accepted':
             raise NotAcceptedError('E-NOT-ACCEPTED', f'the calibration is {self.verdict.level}: '
-                                                     f'{"; ".join(self.verdict.main_reasons)}')
+                                                     f'{self.verdict.main_text}')
         return AcceptedCalibration(**vars(self))
 
 

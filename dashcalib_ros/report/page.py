@@ -82,7 +82,7 @@ def report_html(calibration: CalibrationData, truth: NamedCamera | None = None,
     return template('report.html').render(
         c=c, title=f'Calibration of {c.input_name}' if c.input_name else 'Calibration',
         headline=ADVICE[c.verdict.level], figures=key_figures(c), steps=next_steps(c, folder),
-        warnings=(*c.warnings, *lost), **drawn,
+        warnings=[*map(str, (*c.warnings, *lost))], **drawn,
         reasons=[each.what for each in c.verdict.reasons], shown=len(c.verdict.main_reasons),
         conditions=conditions(c.verdict),
         parameters=parameter_rows(c),

@@ -29,7 +29,7 @@ def rig_html(rig: RigCalibration, cameras: Sequence[Placed]) -> str:
             *(f'translation {axis}, m' for axis in AXES), 'clock, ms')
     return template('compare.html').render(
         title='Cameras of one car', overlines=[f'against {rig.base}'],
-        answers=[*witness_lines(rig), *(reason for camera in rig.cameras.values()
+        answers=[*witness_lines(rig), *(str(reason) for camera in rig.cameras.values()
                                         for reason in camera.reasons)],
         maps=[_drawn(rig, cameras, 1, 'From above', 'm to the left'),
               _drawn(rig, cameras, 2, 'From the side', 'm upwards')] if cameras else [],

@@ -91,7 +91,7 @@ def mounts_text(mount: Mount, other: Mount) -> str:
 
 def verdict_text(mount: Mount) -> str:
     """Return a mounting's verdict, and why it is weak."""
-    return mount.verdict + (f' ({"; ".join(mount.reasons)})' if mount.reasons else '')
+    return mount.verdict + (f' ({"; ".join(map(str, mount.reasons))})' if mount.reasons else '')
 
 
 def mount_text(mount: Mount) -> str:

@@ -290,7 +290,7 @@ class Learner:
     def _bank(self, number: int, use_stored: bool) -> _Bank:
         calibrator = Calibrator(
             self._goal.config, mask=self._mask, live=True, use_stored=use_stored,
-            warn=lambda text: self._hear(Trouble('store', text)),
+            warn=lambda notice: self._hear(Trouble('store', str(notice))),
             on_trouble=lambda text: self._hear(Trouble('workers', text)), on_wait=self._serve)
         return _Bank(number, calibrator)
 

@@ -201,7 +201,7 @@ class Calibrating:
         verdict = result.calibration.verdict
         if verdict.level == 'accepted':
             return True, f'accepted: {sigma_text(calibrated_camera(result.calibration, ""))}'
-        return False, f'{verdict.level}: {"; ".join(verdict.reasons)}'
+        return False, f'{verdict.level}: {"; ".join(map(str, verdict.reasons))}'
 
     def _adopt(self, calibration: Calibration) -> None:
         source = self.drive.source
@@ -324,7 +324,7 @@ class Calibrating:
             state = 'refused_so_far'
             # the reason has what one more turn would bring
             message = (f'not calibrated: {turns}; so far {verdict.level}: '
-                       f'{"; ".join(verdict.reasons[:1])}')
+                       f'{"; ".join(map(str, verdict.reasons[:1]))}')
         if self._stale:
             level = ERROR
             message = f'the published calibration is contradicted; new turns: {turns}'

@@ -178,8 +178,8 @@ class Checking:
             self._log.warning(f'the calibration on {topic} has changed: it is checked again')
         try:
             self._given = camera_of_message(message, topic)
-            for text in self._given.warnings:
-                self._log.warning(text)
+            for warning in self._given.warnings:
+                self._log.warning(str(warning))
             if self._given.faults:
                 self._log.warning(f'the calibration on {topic} is wrong: '
                                   f'{"; ".join(self._given.faults)}')

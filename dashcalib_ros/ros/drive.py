@@ -325,8 +325,8 @@ class Drive:
         self._witnesses = witness_texts(result.calibration.witnesses)
         for text in self._witnesses:
             self._log.info(text)
-        for text in result.calibration.warnings:
-            self._complaints.once(text)
+        for warning in result.calibration.warnings:
+            self._complaints.once(str(warning))
         self._role.judge(result)
         self._answer(*self._role.outcome(result))
 
@@ -371,7 +371,7 @@ class Drive:
             'turning magnitude': f'{now.magnitude:.4f}',
             'standing': now.standing,
             'verdict': verdict.level if verdict else '',
-            'reasons': '; '.join(verdict.main_reasons) if verdict else '',
+            'reasons': verdict.main_text if verdict else '',
             **health.values,
             'warnings': '; '.join(warnings),
             'change': '; '.join(self.changes().values()),

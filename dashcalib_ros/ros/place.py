@@ -336,7 +336,7 @@ class Placing:
 
     @property
     def _reasons(self) -> list[str]:
-        return [reason for camera in self._last.cameras.values()
+        return [str(reason) for camera in self._last.cameras.values()
                 for reason in camera.reasons] if self._last else []
 
 

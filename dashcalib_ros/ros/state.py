@@ -61,7 +61,7 @@ def judge(new: Calibration, complete: bool, published: NamedCamera | None, contr
                              contradictions, limits, 'give_up')
     if new.verdict.level != 'accepted' or new.camera is None or new.sigma is None:
         action: Action = 'wait' if published is None else 'keep'
-        return Judgement(action, '; '.join(new.verdict.main_reasons), contradictions)
+        return Judgement(action, new.verdict.main_text, contradictions)
     if published is None:
         return Judgement('adopt', calibration=new)
     before = _now(published, days, new.temperature_c)

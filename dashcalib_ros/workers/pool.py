@@ -337,7 +337,7 @@ class ScenePool:
             self.lost.append(Notice(
                 'E-TURN-LEFT-OUT', f'{call.turn.id} ended the reconstruction process '
                                    f'{call.failures} times and was left out'))
-            self._on_trouble(self.lost[-1])
+            self._on_trouble(str(self.lost[-1]))
         else:
             if not isinstance(error, DashcalibError):
                 error = WorkerError('E-TURN-FAILED', f'reconstruction of {call.turn.id} failed: '

@@ -18,7 +18,7 @@ from dashcalib_ros import judge, session
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.cli import command, main
 from dashcalib_ros.detect import TurnId
-from dashcalib_ros.errors import InputError
+from dashcalib_ros.errors import InputError, Notice
 from dashcalib_ros.formats import result_json
 from dashcalib_ros.judge import Check, Odometry, Reading
 from dashcalib_ros.judge.odometry import TurnOdometry, TurnPath
@@ -50,7 +50,7 @@ class FakeCalibrator:
         pass
 
     def calibrate(self, progress=None):
-        return make_calibration(warnings=('dark',), mount=self.mount)
+        return make_calibration(warnings=(Notice('', 'dark'),), mount=self.mount)
 
     def _run(self, function, *given):
         """Answer in a worker's place."""

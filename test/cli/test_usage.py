@@ -40,6 +40,7 @@ from dashcalib_ros.cli.arguments import (
 from dashcalib_ros.cli.terminal import show, warn
 from dashcalib_ros.config import Config
 from dashcalib_ros.demo import DEMOS
+from dashcalib_ros.errors import Notice
 from dashcalib_ros.formats.export import EXPORTS
 from dashcalib_ros.formats.rig import rig_json
 from dashcalib_ros.report import write_results
@@ -328,8 +329,8 @@ def test_mountings_are_exported(here, results):
     refused = here('export', results / 'a', '--to', 'urdf')
     assert_one_line_error(refused)
     assert '[E-EXPORT-NO-MOUNTING]' in refused.stderr
-    write_results(make_calibration(mount=replace(MOUNT, verdict='weak', reasons=('so',))),
-                  results / 'weak')
+    weak = replace(MOUNT, verdict='weak', reasons=(Notice('E-MOUNT-LENS', 'so'),))
+    write_results(make_calibration(mount=weak), results / 'weak')
     warned = here('export', results / 'weak', '--to', 'tf')
     assert warned.returncode == 0 and 'weak_optical_frame' in warned.stdout
     assert warned.stderr.endswith(' weak (so) [E-EXPORT-MOUNT-WEAK]\n')
@@ -554,7 +555,7 @@ def test_names_cannot_act_on_a_terminal(results, tmp_path, capsys, monkeypatch, 
     shutil.copytree(results / 'a', FORGED)
     main(['compare', FORGED, FORGED])
     main(['compare', f'{FORGED}/gone', FORGED])
-    warn([f'{FORGED} is odd'])
+    warn([Notice('E-ODD', f'{FORGED} is odd')])
     monkeypatch.setattr(sys.stdout, 'isatty', lambda: terminal)
     show(line(FORGED))
     said = ''.join(capsys.readouterr())

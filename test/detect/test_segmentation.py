@@ -124,7 +124,7 @@ def test_what_is_not_believed_or_not_there_is_said(dark):
         mask.push(picture_with(rows), 0)
         assert mask.hidden((HEIGHT, WIDTH)) is None
         assert mask.warning().code == code
-        assert ('79 %' in mask.warning()) == (code == 'E-SEGMENTATION-TOO-LARGE')
+        assert ('79 %' in str(mask.warning())) == (code == 'E-SEGMENTATION-TOO-LARGE')
 
 
 def test_only_a_car_that_moves_asks(dark):

@@ -49,7 +49,7 @@ def test_only_a_clear_contradiction_is_weak(solution, lines, level):
     assert verdict.level == level
     if level == 'weak':
         assert verdict.codes == ('E-LINES-BENT',)
-        assert 'k1 changed by -0.030 ± 0.002' in verdict.reasons[0]
+        assert 'k1 changed by -0.030 ± 0.002' in str(verdict.reasons[0])
 
 
 def test_how_clear_it_must_be_is_a_setting(solution):

@@ -46,7 +46,7 @@ def test_what_contradicts_is_named_and_left_out(fused):
     assert all(size in shares['small.mp4'].left_out for size in ('640x480', '800x450'))
     assert [shares[f'{n}.mp4'].used for n in range(4)] == [1, 1, 1, 1]
     assert not shares['straight.mp4'].left_out
-    warnings = '; '.join(fused.calibration.warnings)
+    warnings = '; '.join(map(str, fused.calibration.warnings))
     assert {each.code for each in fused.calibration.warnings} == {'E-CLIP-LEFT-OUT'}
     assert all(name in warnings for name in (
         'again.mp4', 'small.mp4', 'enlarged.mp4', 'zoomed.mp4'))
@@ -61,7 +61,7 @@ def test_turns_are_named_by_their_clips(fused):
     sharp = replace(CONFIG, verdict=replace(CONFIG.verdict, max_leverage=0.1))
     verdict = fuse('cam', '', CLIPS, sharp).calibration.verdict
     [reason] = [each for each in verdict.reasons if each.code == 'E-ONE-TURN-DOMINATES']
-    assert '.mp4' in reason and 'earlier' not in '; '.join(verdict.reasons)
+    assert '.mp4' in str(reason) and 'earlier' not in verdict.main_text
 
 
 def with_lines(lens):

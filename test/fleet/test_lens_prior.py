@@ -168,10 +168,10 @@ def test_a_prior_decides_and_the_verdict_says_so(level):
     final = final_of(solved_unit(level), ModelPrior(PRIOR))
     found = final.calibration
     assert found.verdict.level == 'weak'
-    assert 'acme (20 other cameras)' in found.verdict.reasons[0]
+    assert 'acme (20 other cameras)' in str(found.verdict.reasons[0])
     assert found.verdict.codes[0] == 'E-PRIOR-USED'
-    assert f'{100 * final.prior_share:.0f} %' in found.verdict.reasons[0]
-    assert found.verdict.reasons[1].endswith(': too little yaw')
+    assert f'{100 * final.prior_share:.0f} %' in str(found.verdict.reasons[0])
+    assert str(found.verdict.reasons[1]).endswith(': too little yaw')
     assert 0.5 < final.prior_share < 1 and final.prior_units == 20
     assert 520 < found.camera.fx < 530 and found.camera.cx == 400.0
     # fy goes with fx, as the unit's own turns say

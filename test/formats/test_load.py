@@ -304,7 +304,7 @@ def test_numbers_that_no_camera_has_are_refused(tmp_path, changes, code, value):
 def test_what_is_odd_in_a_camera_is_a_warning(tmp_path, changes, code, value):
     found = read(tmp_path, LENS | changes)
     assert [each.code for each in found.warnings] == [code] * bool(code)
-    assert value in ''.join(found.warnings)
+    assert value in ''.join(map(str, found.warnings))
     assert found == NamedCamera(found.name, found.camera)
 
 

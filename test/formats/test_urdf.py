@@ -11,7 +11,7 @@ import pytest
 from made_calibration import MOUNT, TRUTH, make_calibration
 from scipy.spatial.transform import Rotation
 
-from dashcalib_ros.errors import ConfigError
+from dashcalib_ros.errors import ConfigError, Notice
 from dashcalib_ros.formats import calibration_yaml, export, load_camera, result_json
 from dashcalib_ros.judge.calibration import OPTICAL
 from dashcalib_ros.report import NamedCamera
@@ -79,7 +79,8 @@ def test_an_unknown_height_is_not_written():
 def test_frames_have_the_name_of_the_folder_or_the_file(path, name, tmp_path):
     place = tmp_path / path
     place.parent.mkdir(exist_ok=True)
-    found = make_calibration(mount=replace(MOUNT, reasons=('a --> b, <c> & \x01\n--d-',)))
+    odd = Notice('', 'a --> b, <c> & \x01\n--d-')
+    found = make_calibration(mount=replace(MOUNT, reasons=(odd,)))
     place.write_text(result_json(found) if path.endswith('json') else calibration_yaml(found))
     assert set(joints(export(load_camera(place), 'urdf'))) == {
         f'{name}_link', f'{name}_optical_frame'}

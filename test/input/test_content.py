@@ -68,7 +68,7 @@ def test_a_folder_of_videos_under_a_maker_s_suffix(tmp_path):
             tmp_path / f'VID_20260701_10101{n}_00_00{n}.insv')
         (tmp_path / f'{n}.txt').write_text('notes')
     source = open_frames(tmp_path)
-    assert source.count == 24 and 'by Insta360 names' in source.warnings[0]
+    assert source.count == 24 and 'by Insta360 names' in str(source.warnings[0])
     assert open_frames(str(tmp_path / '*')).count == 24
 
 

@@ -330,7 +330,7 @@ def test_a_folder_tells_that_its_pictures_are_turned(tmp_path):
     assert next(iter(source)).size == (40, 60)
     [warning] = source.warnings
     assert warning.code == 'E-IMAGES-ROTATED'
-    assert str(tmp_path) in warning and 'rotated by 90 degrees' in warning
+    assert str(tmp_path) in str(warning) and 'rotated by 90 degrees' in str(warning)
 
 
 def thermal(low, high, seed=0, **changes):

@@ -94,7 +94,7 @@ def test_a_video_of_other_codecs_is_decoded_without_hardware(tmp_path, kind, cod
     late = open_frames(write_packets(tmp_path / 'late', packets[3:], kind, name))
     assert np.allclose(brightness(late), range(8, 20), atol=1)
     assert [each.code for each in late.warnings] == ['E-VIDEO-BEGINS-LATE']
-    assert 'the first 5 images' in late.warnings[0]
+    assert 'the first 5 images' in str(late.warnings[0])
 
 
 def test_a_decoder_that_fails_is_named(tmp_path, monkeypatch):
@@ -141,7 +141,7 @@ def test_a_recording_that_begins_late_waits_for_a_key_picture(tmp_path, codec):
     assert brightness(frames) == list(range(8, 20))
     assert [frame.index for frame in frames] == list(range(5, 17))
     assert [each.code for each in source.warnings] == ['E-VIDEO-BEGINS-LATE']
-    assert 'the first 5 images' in source.warnings[0]
+    assert 'the first 5 images' in str(source.warnings[0])
 
 
 def test_damaged_packets_are_counted_and_the_rest_is_shown(tmp_path):

@@ -115,12 +115,12 @@ def test_undecodable_images_are_skipped_and_counted(tmp_path):
     source = open_frames(write_bag(tmp_path / 'bag', messages))
     assert [frame.index for frame in source] == [0, 1, 3, 5]
     assert source.warnings[0].code == 'E-IMAGES-UNDECODABLE'
-    assert '2 undecodable images skipped (image 2: png image' in source.warnings[0]
+    assert '2 undecodable images skipped (image 2: png image' in str(source.warnings[0])
     folder = write_folder(tmp_path / 'images', frames)
     cut(folder / '0003.png', 0.5)
     source = open_frames(folder, fps=10)
     assert [frame.index for frame in source] == [0, 1, 2, 4, 5]
-    assert '1 undecodable image skipped (image 3: 0003.png' in source.warnings[0]
+    assert '1 undecodable image skipped (image 3: 0003.png' in str(source.warnings[0])
 
 
 def test_nothing_decodable_is_an_error_that_says_why(tmp_path):
@@ -150,7 +150,7 @@ def test_a_cut_video(tmp_path, codec, suffix):
         found = len(list(source))
         assert 20 <= found <= 26
         if source.count != found:
-            assert 'are lost' in source.warnings[0]
+            assert 'are lost' in str(source.warnings[0])
 
 
 def test_paths_that_are_no_drive(tmp_path):
@@ -239,7 +239,7 @@ def test_odd_entries_of_a_folder_are_skipped_counted_and_named(tmp_path):
     source = open_frames(folder, fps=10)
     assert [frame.index for frame in source] == [0, 3, 5]
     [warning] = source.warnings
-    assert warning.startswith('3 undecodable images skipped (image 1: cannot read 0001.png: ')
+    assert str(warning).startswith('3 undecodable images skipped (image 1: cannot read 0001.png: ')
 
 
 @pytest.mark.parametrize('suffix', SUFFIXES)

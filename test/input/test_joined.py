@@ -58,8 +58,8 @@ def test_videos_are_one_drive(tmp_path, how):
         assert np.allclose(brightness(found),
                            [20 + 15 * (n % 12) + n // 12 for n in range(36)], atol=1)
     said = f'{tmp_path}/clips/*.avi' if how == 'pattern' else f'{tmp_path}/clips'
-    assert source.warnings == (() if how == 'list' else (
-        f'{said}: 3 files, ordered by name: clip9.avi, clip10.avi, clip11.avi',))
+    assert [*map(str, source.warnings)] == ([] if how == 'list' else [
+        f'{said}: 3 files, ordered by name: clip9.avi, clip10.avi, clip11.avi'])
 
 
 NAMES = {
@@ -80,10 +80,11 @@ def test_files_in_the_order_of_the_camera(tmp_path, maker):
         path.rename(path.with_name(f'{name}.avi'))
     source = open_frames(tmp_path / 'clips')
     assert [round(each) % 15 for each in brightness(source)[::12]] == [5, 6, 7]
-    assert f'by {maker.split()[-1]} names: {".avi, ".join(NAMES[maker])}.avi' in source.warnings[0]
+    names = f'{".avi, ".join(NAMES[maker])}.avi'
+    assert f'by {maker.split()[-1]} names: {names}' in str(source.warnings[0])
     given = sorted((tmp_path / 'clips').iterdir(), reverse=True)
     [warning] = open_frames(given).warnings
-    assert warning.code == 'E-FILES-AS-GIVEN' and f'{".avi, ".join(NAMES[maker])}.avi' in warning
+    assert warning.code == 'E-FILES-AS-GIVEN' and names in str(warning)
 
 
 def test_files_in_the_order_of_their_times(tmp_path):
@@ -91,10 +92,11 @@ def test_files_in_the_order_of_their_times(tmp_path):
     for name, minute in (('b', 1), ('c', 0), ('a', 2)):
         write_timed(tmp_path / f'{name}.mp4', TIMES[:3],
                     created=f'2023-01-15T12:3{minute}:00.000000Z')
-    assert 'time of recording: c.mp4, b.mp4, a.mp4' in open_frames(
-        str(tmp_path / '*.mp4')).warnings[0]
+    assert 'time of recording: c.mp4, b.mp4, a.mp4' in str(open_frames(
+        str(tmp_path / '*.mp4')).warnings[0])
     write_timed(tmp_path / 'b.mp4', TIMES[:3], created='2023-01-15T12:30:00.000000Z')
-    assert 'name: a.mp4, b.mp4, c.mp4' in open_frames(str(tmp_path / '*.mp4')).warnings[0]
+    assert 'name: a.mp4, b.mp4, c.mp4' in str(open_frames(
+        str(tmp_path / '*.mp4')).warnings[0])
 
 
 def test_front_and_rear_are_not_one_camera(tmp_path):
@@ -195,7 +197,7 @@ def test_a_folder_with_thumbnails_beside_its_videos(tmp_path):
         cv2.imwrite(str(tmp_path / f'clips/{name}.jpg'), np.zeros((4, 4), np.uint8))
     source = open_frames(tmp_path / 'clips')
     assert source.count == 36 and source.warnings[0].code == 'E-FILES-OTHER'
-    assert '2 other files' in source.warnings[0]
+    assert '2 other files' in str(source.warnings[0])
     assert len(open_frames(str(tmp_path / 'clips/clip*')).warnings) == 2
     for index in range(9):
         cv2.imwrite(str(tmp_path / f'clips/{index}.jpg'), np.zeros((4, 4), np.uint8))
@@ -246,11 +248,11 @@ def test_one_that_cannot_be_read_is_left_out(tmp_path):
     assert [frame.perhaps_after_gap for frame in source].index(True) == 12
     assert [each.code for each in source.warnings] == [
         'E-FILES-ORDERED', 'E-FILE-SKIPPED', 'E-FILE-SKIPPED']
-    assert 'clip10.avi, clip11.avi' in source.warnings[0]
-    assert str(paths[0]) in source.warnings[1] and 'clip99.mp4' in source.warnings[2]
+    assert 'clip10.avi, clip11.avi' in str(source.warnings[0])
+    assert str(paths[0]) in str(source.warnings[1]) and 'clip99.mp4' in str(source.warnings[2])
     source = open_frames([tmp_path / 'missing.mp4', paths[1]])
     assert len(list(source)) == 12 and source.warnings[0].code == 'E-FILE-SKIPPED'
-    assert 'missing.mp4' in source.warnings[0]
+    assert 'missing.mp4' in str(source.warnings[0])
 
 
 def test_none_that_can_be_read(tmp_path):
@@ -286,8 +288,9 @@ def test_segments_of_one_name_are_told_by_their_folders(tmp_path, how):
     assert np.allclose(brightness(source)[::4], [40, 50, 90], atol=1)
     [warning] = source.warnings
     assert warning.code == 'E-FILES-ORDERED'
-    assert 'route--0, route--2, route--10' in warning and 'road' not in warning.split(': ', 1)[1]
-    assert 'route--1, route--3' in warning and 'route--9' in warning
+    assert 'route--0, route--2, route--10' in str(warning)
+    assert 'road' not in str(warning).split(': ', 1)[1]
+    assert 'route--1, route--3' in str(warning) and 'route--9' in str(warning)
 
 
 def test_an_order_that_is_not_alphabetical_is_kept(tmp_path):
@@ -301,7 +304,7 @@ def test_an_order_that_is_not_alphabetical_is_kept(tmp_path):
 def test_numbers_that_may_have_no_others_between_them_are_no_gap(tmp_path, numbers):
     segments(tmp_path, numbers)
     [warning] = open_frames(str(tmp_path / 'route--*/road.avi')).warnings
-    assert 'missing' not in warning
+    assert 'missing' not in str(warning)
 
 
 def test_one_that_breaks_while_it_is_read(tmp_path):
@@ -310,7 +313,7 @@ def test_one_that_breaks_while_it_is_read(tmp_path):
     paths[1].unlink()
     assert [frame.index for frame in source] == list(range(24))
     assert [each.code for each in source.warnings] == ['E-FILE-SKIPPED']
-    assert str(paths[1]) in source.warnings[0]
+    assert str(paths[1]) in str(source.warnings[0])
 
 
 def test_sizes_must_agree(tmp_path):
@@ -328,7 +331,7 @@ def test_undecodable_images_are_told_by_their_file(tmp_path):
     source = open_frames(folders, fps=10)
     assert [frame.index for frame in source] == [0, 1, 2, 3, 5]
     assert source.warnings[0].code == 'E-IMAGES-UNDECODABLE'
-    assert f'{folders[1]}: image 4: ' in source.warnings[0]
+    assert f'{folders[1]}: image 4: ' in str(source.warnings[0])
 
 
 def test_an_undecodable_first_image_leaves_the_question_to_the_next(tmp_path):
@@ -342,7 +345,7 @@ def test_an_undecodable_first_image_leaves_the_question_to_the_next(tmp_path):
 def test_what_all_files_say_is_said_once(tmp_path):
     folders = [write_folder(tmp_path / name, drive(3)) for name in 'abc']
     warning, = open_frames(folders).warnings
-    assert warning.code == 'E-RATE-ASSUMED' and 'and 2 more like it' in warning
+    assert warning.code == 'E-RATE-ASSUMED' and 'and 2 more like it' in str(warning)
 
 
 @pytest.mark.parametrize('text, code, remedy', [

@@ -91,7 +91,7 @@ def test_a_stream_that_is_damaged_is_not_used_and_told_in_one_line(tmp_path, cha
     assert found.rate is None and found.empty
     [warning] = found.warnings
     assert warning.code == 'E-MOTION-NOT-USED'
-    assert line in warning and len(warning.splitlines()) == 1
+    assert line in str(warning) and len(str(warning).splitlines()) == 1
 
 
 def gpx(points):
@@ -127,7 +127,7 @@ def test_whole_seconds_at_10_hz_give_one_place_a_second(tmp_path):
     found = read_motion(write(tmp_path / 'whole.gpx', gpx(times)))
     assert found.position is not None and len(found.position.stamps_s) == 60
     [warning] = found.warnings
-    assert warning.code == 'E-MOTION-STAMPS-EQUAL' and f'{tmp_path}/whole.gpx' in warning
+    assert warning.code == 'E-MOTION-STAMPS-EQUAL' and f'{tmp_path}/whole.gpx' in str(warning)
 
 
 def test_stamps_of_another_unit_are_said(tmp_path):
@@ -135,7 +135,7 @@ def test_stamps_of_another_unit_are_said(tmp_path):
     found = read_motion(write(tmp_path / 'ms.csv', f'#stamp_s, speed\n{rows}\n'))
     [warning] = found.warnings
     assert found.absolute and warning.code == 'E-STAMP-UNIT-ASSUMED'
-    assert f'{tmp_path}/ms.csv' in warning and 'milliseconds' in warning
+    assert f'{tmp_path}/ms.csv' in str(warning) and 'milliseconds' in str(warning)
     assert abs(found.speed.stamps_s[-1] - 1700000000.19) < 1e-6
     with refused(InputError, 'E-STAMP-UNIT', 'odd.csv', '1e+40'):
         read_motion(write(tmp_path / 'odd.csv', 'stamp_s,speed\n1e40,1\n2e40,1\n'))
@@ -307,7 +307,7 @@ def test_one_stamp_of_another_clock_costs_one_point(tmp_path, stray, place):
     found = read_motion(write(tmp_path / 'track.gpx', gpx(texts)))
     assert len(found.position.stamps_s) == 59 and np.ptp(found.position.stamps_s) < 60
     [told] = found.warnings
-    assert told.code == 'E-MOTION-OTHER-CLOCK' and '1 of 60 positions' in told
+    assert told.code == 'E-MOTION-OTHER-CLOCK' and '1 of 60 positions' in str(told)
 
 
 def by_day(first_s, last_s):
@@ -325,8 +325,8 @@ def test_the_time_of_a_recording_tells_where_a_video_lies_in_a_stream(tmp_path):
     for later, zone in ((7200, ' 2 h '), (-19800, ' 5.5 h '), (10 * 86400, '')):
         found = open_drive(video, motion=by_day(begin + later - 30, begin + later + 60)).motion
         [told] = found.warnings
-        assert told.code == 'E-MOTION-OTHER-DAY' and zone in told
-        assert ('zone' in told) == bool(zone) and found.since(0.0).first_s == 0.0
+        assert told.code == 'E-MOTION-OTHER-DAY' and zone in str(told)
+        assert ('zone' in str(told)) == bool(zone) and found.since(0.0).first_s == 0.0
     # several files begin with their first one
     other = write_timed(tmp_path / 'b.mp4', created='2023-11-14T22:14:20.000000Z')
     assert open_drive([video, other], motion=by_day(
@@ -358,7 +358,7 @@ def test_places_of_no_fix_are_left_out_and_said(tmp_path, lost):
     assert np.ptp(found.position.values[:, 0]) == pytest.approx(29e-4 * DEGREE_M * np.cos(
         np.radians(49)))
     [warning] = found.warnings
-    assert warning.code == 'E-GPS-NO-FIX' and f'31 positions of {path}' in warning
+    assert warning.code == 'E-GPS-NO-FIX' and f'31 positions of {path}' in str(warning)
 
 
 def test_a_gps_that_never_had_a_fix_is_not_used(tmp_path):
@@ -438,11 +438,11 @@ def test_of_several_topics_none_is_used_until_one_is_chosen(tmp_path, monkeypatc
         *(imu(n) for n in range(20)), *(imu(n, '/other') for n in range(20))])
     found = bag_motion([path], NONE)
     [line] = found.warnings
-    assert found.empty and line.code == 'E-MOTION-TOPICS' and '/imu, /other' in line
+    assert found.empty and line.code == 'E-MOTION-TOPICS' and '/imu, /other' in str(line)
     assert bag_motion([path], {'imu': 'other'}).rate is not None
     monkeypatch.setattr(motion_files, 'SAMPLES', 19)
     [line] = bag_motion([path], {'imu': 'other'}).warnings
-    assert line.code == 'E-MOTION-TOO-LONG' and '/other' in line
+    assert line.code == 'E-MOTION-TOO-LONG' and '/other' in str(line)
     with refused(InputError, 'E-BAG-TOPIC-UNKNOWN', "imu topic '/none'", '/imu, /other'):
         bag_motion([path], {'imu': '/none'})
 
@@ -492,7 +492,7 @@ def test_a_bag_whose_gps_begins_at_0_0(tmp_path):
                                         *(fix(n) for n in range(10, 20))])
     found = bag_motion([path], NONE)
     assert len(found.position.values) == 10 and found.warnings[0].code == 'E-GPS-NO-FIX'
-    assert '10 positions' in found.warnings[0]
+    assert '10 positions' in str(found.warnings[0])
     assert found.since(START / 1e9).position.stamps_s[0] == pytest.approx(1.0, abs=1e-5)
 
 
@@ -514,7 +514,7 @@ def test_images_and_sensors_of_different_clocks_are_aligned_by_reception(tmp_pat
     found = bag_motion([path], NONE, '/camera').since(start_s)
     np.testing.assert_allclose(found.rate.stamps_s, np.arange(100) / 100 - 0.35, atol=1e-5)
     [line] = found.warnings
-    assert line.code == 'E-MOTION-CLOCK' and '/imu' in line
+    assert line.code == 'E-MOTION-CLOCK' and '/imu' in str(line)
 
 
 def test_images_and_sensors_of_one_uptime_keep_it(tmp_path):
@@ -651,7 +651,7 @@ def test_a_whole_hour_is_told_with_its_option(tmp_path):
     path = write(tmp_path / 'Gyroscope.csv', '\n'.join(LOGS['Gyroscope.csv']))
     later = EPOCH_NS + 3600 * 10**9 + 10**8
     [line] = read_motion(path).on_clock_of(later, True, None).warnings[-1:]
-    assert line.code == 'E-MOTION-OTHER-DAY' and '--sensor-offset=3600s' in line
+    assert line.code == 'E-MOTION-OTHER-DAY' and '--sensor-offset=3600s' in str(line)
     shifted = read_motion(path).shifted(3600.0).on_clock_of(later, True, None)
     assert 'E-MOTION-OTHER-DAY' not in [each.code for each in shifted.warnings]
 

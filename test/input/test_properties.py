@@ -96,7 +96,7 @@ def test_stamps_of_a_recording_increase(stamps: list[tuple[int, int]]) -> None:
     gate = StampGate()
     used = [time for each in stamps if (time := gate.take(*each)) is not None]
     assert used == sorted(set(used))
-    assert all('\n' not in line for line in gate.warnings())
+    assert all('\n' not in str(line) for line in gate.warnings())
 
 
 @QUICK

@@ -71,7 +71,7 @@ def test_a_bag_of_any_damage(bags: dict[str, Path], kind: str, damage: list[tupl
     except InputError as error:
         assert len(str(error).splitlines()) == 1
         return
-    assert all(len(line.splitlines()) == 1 for line in source.warnings)
+    assert all(len(str(line).splitlines()) == 1 for line in source.warnings)
     stamps = [frame.stamp_ns for frame in found]
     assert stamps == sorted(set(stamps))
     indices = [frame.index for frame in found]

@@ -52,7 +52,7 @@ def test_names_that_are_stamps_are_the_times(naming):
     assert found.names == names and found.recorded
     np.testing.assert_allclose(np.array(found.stamps_ns) - found.stamps_ns[0], TIMES, atol=1.1e6)
     [told] = found.notices
-    assert told.code == 'E-TIMES-READ' and '20 images per second' in told
+    assert told.code == 'E-TIMES-READ' and '20 images per second' in str(told)
     if 'uptime' not in naming and 'short' not in naming:
         assert abs(found.stamps_ns[0] - BEGIN) < 10**6
     # they have holes, of which a rate knows nothing
@@ -78,7 +78,7 @@ def test_numbers_of_two_parts_are_no_fractions():
 def test_milliseconds_without_a_date_are_only_times_without_a_rate():
     names = [f'{round(n * 33.34):06}.jpg' for n in range(60)]
     found = times_of(Path('/nowhere/images'), names, None)
-    assert found.stamps_ns[3] == 100_000_000 and 'milliseconds' in found.notices[0]
+    assert found.stamps_ns[3] == 100_000_000 and 'milliseconds' in str(found.notices[0])
     assert times_of(Path('/nowhere/images'), names, 15.0).stamps_ns[3] == 200_000_000
 
 
@@ -88,7 +88,8 @@ def test_missing_numbers_keep_their_time():
     assert np.diff(found.stamps_ns).tolist().count(100_000_000) == len(names) - 3
     assert found.stamps_ns[-1] == 2_900_000_000 and found.length_ns == 3_000_000_000
     [told] = found.notices
-    assert told.code == 'E-IMAGES-MISSING' and '3 images' in told and 'left_000027.jpg' in told
+    assert told.code == 'E-IMAGES-MISSING'
+    assert '3 images' in str(told) and 'left_000027.jpg' in str(told)
 
 
 def test_numbers_without_a_step_are_named():
@@ -157,7 +158,7 @@ def test_a_list_beside_the_images_has_their_times(tmp_path, file):
                                atol=1001)
     assert source.recorded == (source._stamps_ns[0] != 0)
     [told] = source.warnings
-    assert told.code == 'E-TIMES-READ' and Path(file).name in told
+    assert told.code == 'E-TIMES-READ' and Path(file).name in str(told)
     assert [each.code for each in FolderSource(folder, fps=10.0).warnings] == ['E-FPS-IGNORED']
 
 
@@ -210,7 +211,7 @@ def test_a_list_of_times_that_is_of_no_use_is_named(tmp_path, text):
     (tmp_path / 'times.txt').write_text(text)
     source = FolderSource(folder, fps=10.0)
     assert [each.code for each in source.warnings] == ['E-TIMES-UNUSED']
-    assert 'times.txt' in source.warnings[0] and source._stamps_ns[1] == 100_000_000
+    assert 'times.txt' in str(source.warnings[0]) and source._stamps_ns[1] == 100_000_000
 
 
 def test_images_that_a_list_lacks_are_skipped_and_said(tmp_path):

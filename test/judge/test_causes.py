@@ -90,7 +90,7 @@ def test_pixels_are_those_of_the_input(solution):
     far = replace(solution.around, ratios=solution.around.ratios * 1.25)
     verdict = judge(replace(solution, around=far, px=0.25), CONFIG.verdict)
     reason = verdict.reasons[verdict.codes.index('E-TWO-FOCAL-LENGTHS')]
-    assert f'{0.25 * solution.camera.fx:.0f} px and about' in reason
+    assert f'{0.25 * solution.camera.fx:.0f} px and about' in str(reason)
 
 
 MOVES, TIMES = 'E-PICTURE-MOVES', 'E-TIMES-ASSUMED'

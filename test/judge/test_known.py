@@ -91,7 +91,7 @@ def test_a_known_height_above_the_road_tells_the_focal_length(found):
     [warning] = [each for each in conclude(
         found, Evidence(SIZE, 300, (), {}, np.zeros((0, 2)), None, FULL_SIZE, {}),
         knowing(height='1.5')).warnings if each.code == 'E-KNOWN-HEIGHT']
-    assert '--motion' in warning
+    assert '--motion' in str(warning)
 
 
 def test_nothing_known_is_nothing_changed(found):

@@ -223,7 +223,7 @@ def test_it_is_never_better_than_the_lens(solution):
     vague[3, 3] = 5.0**2
     found = mount_of(pairs, None, with_covariance(known, vague), 'accepted', None)
     assert found.verdict == 'weak' and codes_of(found.reasons) == ['E-MOUNT-SIGMA']
-    assert 'drive more turns' in found.reasons[0]
+    assert 'drive more turns' in str(found.reasons[0])
     assert found.sigma['pitch_up_deg'] > np.degrees(5.0 / LENS.fy)
     assert found.travel_sigma_px == weak.travel_sigma_px
 
@@ -251,7 +251,7 @@ def test_a_lens_that_is_not_accepted_never_has_an_accepted_mount(
         assert which == 0 and turns == 0
         return
     assert found.verdict == 'weak' and codes_of(found.reasons)[0] == 'E-MOUNT-LENS'
-    assert level in found.reasons[0]
+    assert level in str(found.reasons[0])
     # with the same evidence, only sigma decides for an accepted lens
     better = mount_of(drives[which], None, known, 'accepted', None)
     known_well = max(better.sigma['yaw_left_deg'], better.sigma['pitch_up_deg']) <= 0.2
@@ -263,7 +263,7 @@ def test_few_straights_say_to_drive_on(solution):
     found = mount_of(pairs_of(mounted(0, 0, 0), count=10, noise_px=4.0), None, known, 'accepted',
                      None)
     assert found.verdict == 'weak' and codes_of(found.reasons) == ['E-MOUNT-SIGMA']
-    assert 'drive straight on' in found.reasons[0]
+    assert 'drive straight on' in str(found.reasons[0])
 
 
 @settings(max_examples=50, deadline=None)
@@ -289,7 +289,9 @@ def test_a_file_keeps_it(tmp_path):
     assert data['mount'].pop('reason_codes') == ['E-MOUNT-SIGMA']
     path.write_text(json.dumps(data))
     older = load_calibration(path).mount
-    assert older == mount and codes_of(older.reasons) == ['']
+    assert older == replace(mount, reasons=older.reasons)
+    assert [*map(str, older.reasons)] == [*map(str, mount.reasons)]
+    assert codes_of(older.reasons) == ['']
 
 
 def test_the_pairs_of_a_long_drive_are_few_and_spread():

@@ -47,13 +47,13 @@ def test_where_nothing_is_known_nothing_is_told(four):
 def test_a_verdict_tells_it_with_the_first_cure(four):
     verdict = judge(four, NEEDS_MORE, outlook=True)
     assert verdict.level == 'weak'
-    assert verdict.reasons[0].endswith(f' ({next_turn(four)})') and next_turn(four)
-    assert verdict.reasons[0].endswith(': ' + verdict.remedies[0])
+    assert str(verdict.reasons[0]).endswith(f' ({next_turn(four)})') and next_turn(four)
+    assert str(verdict.reasons[0]).endswith(': ' + verdict.remedies[0])
 
 
 def test_where_something_contradicts_the_result_more_turns_are_no_cure(four):
     strange = dataclasses.replace(NEEDS_MORE, max_aspect=0.0)
     verdict = judge(four, strange, outlook=True)
     assert verdict.codes == ('E-FEW-TURNS', 'E-PIXEL-ASPECT')
-    assert next_turn(four) not in ' '.join(verdict.reasons)
+    assert next_turn(four) not in ' '.join(map(str, verdict.reasons))
     assert judge(four, CONFIG.verdict, outlook=True).reasons == ()

@@ -119,7 +119,7 @@ def test_every_objection_is_a_row_that_failed_and_they_come_first(drawn):
     known = f'{100 * long.sigma[0] / long.camera.fx:.2g} %'
     assert [(row.value, row.limit) for row in rows[:3]] == [
         ('3', 'at least 4'), (known, 'at most 0.1 %'), ('', '')]
-    assert verdict.reasons[2].startswith(rows[2].name)
+    assert str(verdict.reasons[2]).startswith(rows[2].name)
     text = report_html(dataclasses.replace(drawn, verdict=verdict))
     assert text.count('<tr class="objection">') == 3 and '<code>E-LONG-READOUT</code>' in text
     assert text.index('<code>E-LONG-READOUT</code>') < text.index('rise of the error when')

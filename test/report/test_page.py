@@ -34,7 +34,7 @@ def terminal(renderable, **options):
 
 @pytest.mark.parametrize('level', ['accepted', 'weak', 'refused'])
 def test_the_page_shows_the_verdict_and_needs_nothing_else(level):
-    text = report_html(make_calibration(level, warnings=('bag is cut short',)))
+    text = report_html(make_calibration(level, warnings=(Notice('', 'bag is cut short'),)))
     page = Page(text)
     assert f'<strong>{level}</strong>' in text
     assert 'bag is cut short' in page.text
@@ -66,7 +66,7 @@ def test_every_model_s_parameters_are_shown_with_their_sigmas(model):
 def test_text_from_outside_is_escaped():
     evil = '<script>alert(1)</script>&"'
     calibration = make_calibration(
-        'weak', input_name=evil, warnings=(evil,), versions={evil: evil})
+        'weak', input_name=evil, warnings=(Notice('', evil),), versions={evil: evil})
     calibration = dataclasses.replace(
         calibration, verdict=dataclasses.replace(calibration.verdict, reasons=(Notice('', evil),)))
     page = Page(report_html(calibration))

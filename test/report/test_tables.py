@@ -107,8 +107,9 @@ def test_terminal_and_page_say_what_knowledge_contributed():
 
 
 def test_terminal_and_page_describe_a_mounting_alike():
-    mount = dataclasses.replace(MOUNT, verdict='weak', reasons=('the lens is weak',),
-                                yaw_left_deg=-2.0, pitch_up_deg=-1.0)
+    weak = Notice('E-MOUNT-LENS', 'the lens is weak')
+    mount = dataclasses.replace(MOUNT, verdict='weak', reasons=(weak,), yaw_left_deg=-2.0,
+                                pitch_up_deg=-1.0)
     calibration = make_calibration(mount=mount)
     shown = terminal(summary(calibration), 200), Page(report_html(calibration)).text
     for text in shown:

@@ -32,6 +32,7 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.detect.one_camera import OtherCamera
+from dashcalib_ros.errors import Notice
 from dashcalib_ros.formats import load_camera
 from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge import TurnSummary, Verdict
@@ -181,7 +182,7 @@ def test_a_disk_that_takes_nothing_is_counted_and_the_calibration_published(make
 def test_each_warning_of_a_calibration_is_logged_once(make_desk, capfd):
     desk = make_desk()
     for _ in range(2):
-        desk.give('weak', warnings=('the mask is odd', 'a turn is odd'))
+        desk.give('weak', warnings=(Notice('', 'the mask is odd'), Notice('', 'a turn is odd')))
     logged = capfd.readouterr().err
     for words in ('the mask is odd', 'a turn is odd'):
         assert [line.split()[0] for line in logged.splitlines() if words in line] == ['[WARN]']

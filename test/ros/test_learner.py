@@ -399,7 +399,7 @@ def test_sensors_that_cannot_be_used_are_told_at_the_next_calibration(desk):
     core = Core.made[0]
     core.ready = at(10, 20)
     until(lambda: desk.results)
-    assert core.motion.empty and 'not used' in core.motion.warnings[0]
+    assert core.motion.empty and 'not used' in str(core.motion.warnings[0])
 
 
 def test_a_failing_core_ends_no_thread(desk, monkeypatch):

@@ -88,11 +88,11 @@ def test_a_model_that_was_asked_for_is_weak_where_the_turns_choose_one_far_from_
     tried = {each.model: each for each in found.tried}
     assert [name for name, each in tried.items() if each.chosen] == ['brown']
     verdict = judge(found, CONFIG.verdict)
-    far = verdict.reasons[verdict.codes.index('E-ANOTHER-MODEL')]
+    far = str(verdict.reasons[verdict.codes.index('E-ANOTHER-MODEL')])
     assert 'brown' in far and 'fisheye' in far
     assert f' {found.px * tried["fisheye"].apart_px:.1f} px' in far and ' 0.0 px' not in far
     own = tuple(each if each.chosen else replace(each, apart_px=None) for each in found.tried)
-    assert 'far apart' in ' '.join(judge(replace(found, tried=own), CONFIG.verdict).reasons)
+    assert 'far apart' in judge(replace(found, tried=own), CONFIG.verdict).main_text
 
 
 def test_a_model_with_fewer_coefficients_is_weak_where_the_picture_needs_them(brown):

@@ -77,7 +77,7 @@ def test_a_stabilised_video_is_found_and_taken_out():
     verdict = judge(found, CONFIG.verdict)
     assert verdict.level == 'weak' and verdict.remedies[0] == STEADY
     assert verdict.codes[0] == 'E-PICTURE-MOVES'
-    assert re.search(r'by up to \d+\.\d %', verdict.reasons[0])
+    assert re.search(r'by up to \d+\.\d %', str(verdict.reasons[0]))
     # ... also before what refuses it; what is less than the picture is known by does no harm
     both = judge(found, replace(CONFIG.verdict, min_yaw_deg=1e3)).codes
     assert both[:2] == ('E-PICTURE-MOVES', 'E-LITTLE-YAW')

@@ -128,10 +128,10 @@ def test_turns_without_stamps_know_nothing_of_the_shutter():
 
 def test_a_readout_that_no_shutter_has_is_weak():
     solution = solved(scenes_of(2, tracks=110, keyframes=12))
-    assert not any('rows' in reason for reason in judge(solution, CONFIG.verdict).reasons)
+    assert not any('rows' in str(reason) for reason in judge(solution, CONFIG.verdict).reasons)
     slow = replace(solution, readout_s=-0.08)
     verdict = judge(slow, CONFIG.verdict)
-    assert verdict.level != 'accepted' and any('80 ms' in reason for reason in verdict.reasons)
+    assert verdict.level != 'accepted' and '80 ms' in verdict.main_text
     # what may be none is not told
     unsure = replace(slow, readout_sigma_s=0.03)
-    assert not any('rows' in reason for reason in judge(unsure, CONFIG.verdict).reasons)
+    assert not any('rows' in str(reason) for reason in judge(unsure, CONFIG.verdict).reasons)
