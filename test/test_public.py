@@ -48,7 +48,7 @@ ERRORS = ('ConfigError', 'DashcalibError', 'InputError', 'NotAcceptedError', 'Ou
           'WorkerError')
 NAMES = (*FUNCTIONS, *ERRORS, 'AcceptedCalibration', 'Calibration', 'Calibrator', 'Config',
          'Check', 'Comparison', 'NamedCamera', 'Frame', 'Camera', 'Radial', 'Brown', 'Fisheye',
-         'Rational', 'RigCalibration', 'SensorStream', 'Status', 'Verdict')
+         'Notice', 'Rational', 'RigCalibration', 'SensorStream', 'Status', 'Verdict')
 # what mypy --strict accepts of a user
 SCRIPT = """
 from dashcalib_ros import calibrate
