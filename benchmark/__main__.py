@@ -54,6 +54,7 @@ PARTS = (
     Part('lines', 60, 'straight lines as a check of the distortion; after `check`'),
     Part('accuracy', 240, 'errors, sigmas, false accepts, refusals: rendered and recorded drives'),
     Part('population', 75, 'random dashcams: accepted, rays off, error over sigma, readouts'),
+    Part('thorough', 70, 'all stretches of longer drives, behind a windscreen'),
     Part('spoilt_tracks', 30, 'two turns whose pictures wander or are stretched: accepted and '
          'wrong; after `population`'),
     Part('real', 60, 'recorded drives: all combinations of turns, against poses, boards and gyro'),

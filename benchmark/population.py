@@ -268,10 +268,9 @@ def _named(*names: str) -> dict[str, float]:
     return dict.fromkeys(names, 1e-9)
 
 
-def reconstructed(seed: int, config: Config) -> Case:
+def reconstructed(drive: Drive, config: Config) -> Case:
     """Render a drive, detect and reconstruct its turns."""
     cv2.setNumThreads(1)
-    drive = drive_of(seed)
     lens: AnyLens = drive.wide_lens if isinstance(drive, WideDrive) else drive.lens
     with Calibrator(config, inline=True) as calibrator:
         for frame in _looked_at(drive, config.tracking.rate):
@@ -290,7 +289,7 @@ def reconstructed(seed: int, config: Config) -> Case:
                        np.linspace(0, lens.height - 1, GRID[1]))
     pixels = np.column_stack([x.ravel(), y.ravel()])
     rays = rays_of(lens, pixels)
-    return Case(seed, chosen.config, tuple(scenes), tuple(more), evidence,
+    return Case(drive.spec.seed, chosen.config, tuple(scenes), tuple(more), evidence,
                 (lens.width, lens.height), parameters_of(lens), pixels, rays,
                 closest_cameras(lens, rays, pixels), drive.spec.rolling_shutter_ms, lens.glass,
                 drive.spec, processor_s())
@@ -404,10 +403,11 @@ def summary(rows: Sequence[Row]) -> str:
     rows = [row for row in rows if row['verdict'] != 'failed']
     return '\n\n'.join([
         *(f'Failed: seed {row["seed"]}: {row["reasons"][0]}' for row in failed),
-        _bars(rows), _groups(rows), _sigmas(rows), _shutters(rows), _names(rows), _cameras(rows)])
+        _bars(rows), groups(rows), _sigmas(rows), _shutters(rows), _names(rows), cameras(rows)])
 
 
-def _groups(rows: Sequence[Row]) -> str:
+def groups(rows: Sequence[Row]) -> str:
+    """Return a table of verdicts and errors by kind of camera."""
     lines = []
     for name, belongs in GROUPS.items():
         mine = [row for row in rows if belongs(row)]
@@ -527,7 +527,8 @@ def _quantile(values: Sequence[float], share: float) -> float:
     return float(np.quantile(values, share)) if values else math.nan
 
 
-def _cameras(rows: Iterable[Row]) -> str:
+def cameras(rows: Iterable[Row]) -> str:
+    """Return a table with a line for each camera."""
     lines = []
     for row in rows:
         z = row.get('z', {})
@@ -576,7 +577,7 @@ def run(seed: int, out: Path, stage: str, again: bool, config: Config) -> None:
 
 
 def _write_case(seed: int, config: Config, path: Path) -> str:
-    case = reconstructed(seed, config)
+    case = reconstructed(drive_of(seed), config)
     save_case(case, path)
     return f'{len(case.scenes)} scenes of {len(case.spec.turn_list)} turns, {case.cpu_s:.0f} CPU s'
 

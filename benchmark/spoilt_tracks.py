@@ -17,7 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 from measure import isolated, keep_table, load, parser_with, save, table
-from population import Case, calibrated, load_case, reconstructed, save_case
+from population import Case, calibrated, drive_of, load_case, reconstructed, save_case
 
 from dashcalib_ros import Config
 from dashcalib_ros.reconstruct.scene import Scene
@@ -73,7 +73,7 @@ def main() -> None:
     for seed in args.seeds:
         case = scenes / f'{seed}.scenes.pkl'
         if not case.exists():
-            save_case(reconstructed(seed, Config()), case)
+            save_case(reconstructed(drive_of(seed), Config()), case)
         for way in WAYS:
             if f'{seed} | {way}' not in rows:
                 done = isolated(measured, case, way)
