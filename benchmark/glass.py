@@ -65,8 +65,8 @@ def drives(seeds: list[int]) -> Iterator[tuple[str, int, Drive]]:
 def measured(pictures: Any, lens: Lens, seed: int) -> dict[str, Any]:
     """Calibrate a drive; return what is wrong with the result (in a process of its own)."""
     found, seconds = calibrate(pictures, Config(seed=seed))
-    about = {'verdict': found.verdict.level, 'reasons': list(found.verdict.reasons),
-             'warnings': list(found.warnings), 'seconds': seconds}
+    about = {'verdict': found.verdict.level, 'reasons': [*map(str, found.verdict.reasons)],
+             'warnings': [*map(str, found.warnings)], 'seconds': seconds}
     if found.camera is None or found.sigma_px is None:
         return about
     x, y = np.meshgrid(np.linspace(0, lens.width - 1, GRID[0]),

@@ -96,7 +96,7 @@ def whole_row(name: str, seed: int, cache: Path) -> dict[str, Any]:
     """Return what lines say about the calibration of a drive that check.py has solved."""
     found = solved_drive(name, seed, cache).calibration
     lines = found.straight_lines
-    return {'verdict': found.verdict.level, 'reasons': found.verdict.reasons,
+    return {'verdict': found.verdict.level, 'reasons': [*map(str, found.verdict.reasons)],
             'lines': _plain(lines), 'sigmas': None if lines is None else lines.sigmas}
 
 

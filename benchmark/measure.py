@@ -285,11 +285,11 @@ def summarised(result: CalibrationData, truth: Mapping[str, Any],
                known: Sequence[str] = ALL_KEYS) -> dict[str, Any]:
     """Return a calibration as a row of results; known: see errors()."""
     row: dict[str, Any] = {
-        'verdict': result.verdict.level, 'reasons': list(result.verdict.reasons),
+        'verdict': result.verdict.level, 'reasons': [*map(str, result.verdict.reasons)],
         'frames': result.frames, 'turns_used': sum(turn.used for turn in result.turns),
         'turns': [[turn.center, turn.used, turn.yaw_deg] for turn in result.turns],
         'misfits': [turn.misfit for turn in result.turns], 'timing': result.timing,
-        'truth_model': model_of(truth), 'warnings': list(result.warnings),
+        'truth_model': model_of(truth), 'warnings': [*map(str, result.warnings)],
         # of an older calibration there is none
         'fixed_camera': {kind: found['strength'] for kind, found in
                          result.details.get('fixed_camera', {}).items()}}

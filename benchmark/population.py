@@ -340,8 +340,8 @@ def measured(path: Path) -> dict[str, Any]:
     case, before = load_case(path), processor_s()
     found = calibrated(case)
     row: dict[str, Any] = {
-        'verdict': found.verdict.level, 'reasons': list(found.verdict.reasons),
-        'warnings': list(found.warnings), 'turns': len(case.spec.turn_list),
+        'verdict': found.verdict.level, 'reasons': [*map(str, found.verdict.reasons)],
+        'warnings': [*map(str, found.warnings)], 'turns': len(case.spec.turn_list),
         'turns_used': found.turns_used, 'size': case.size, 'rate': case.spec.rate,
         'truth_model': case.lens['model'], 'glass_px': case.glass.rms_px if case.glass else 0.0,
         'look': case.glass.look if case.glass else '', 'readout_ms': case.readout_ms,

@@ -82,7 +82,7 @@ def measured(drive: Recorded, data: Path, seed: int) -> dict[str, Any]:
     whole = solve(scenes, config)
     calibration = conclude(whole, evidence_of_detection(detection, scenes), config)
     row: dict[str, Any] = {'verdict': calibration.verdict.level, 'turns': len(scenes),
-                           'reasons': list(calibration.verdict.reasons)}
+                           'reasons': [*map(str, calibration.verdict.reasons)]}
     if whole is None:
         return row
     sharp = {scene.turn for scene in whole.scenes if sharpness(scene) >= SHARP_DEG}
@@ -147,7 +147,8 @@ def by_all_stretches(drive: Recorded, data: Path) -> dict[str, Any]:
     """Return what `dashcalib run --thorough` finds."""
     found = calibrate(data / drive.name / drive.pictures, fps=drive.fps,
                       config={'turns.thorough': True})
-    row: dict[str, Any] = {'verdict': found.verdict.level, 'reasons': list(found.verdict.reasons),
+    row: dict[str, Any] = {'verdict': found.verdict.level,
+                           'reasons': [*map(str, found.verdict.reasons)],
                            'stretches': sum(turn.used for turn in found.turns)}
     if found.camera is None or found.sigma is None:
         return row
