@@ -85,7 +85,8 @@ def ask(solved: Solved) -> dict[str, Any]:
         found = check(camera, calibration.image_size, solution, calibration.verdict, config)
         row = {'answer': found.answer, 'reasons': [*map(str, found.reasons)],
                'rms_px': found.rms_px, 'worst_px': found.worst_px, 'distance': found.distance,
-               'limit': found.limit, 'loss': found.loss, 'seconds': round(time.perf_counter() - started, 2)}
+               'limit': found.limit, 'loss': found.loss,
+               'seconds': round(time.perf_counter() - started, 2)}
         if solution is not None and calibration.verdict.level == 'accepted':
             spoiled, true = (difference_of(each, solution, px)
                              for each in (taken, truth))
