@@ -11,7 +11,7 @@ from dashcalib_ros.detect import Turn, TurnId
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.detect.turn import is_turn
 from dashcalib_ros.errors import Notice
-from dashcalib_ros.reconstruct.scene import Scene
+from dashcalib_ros.reconstruct.scene import BEND_DEG, Scene
 from dashcalib_ros.report.turns import direction
 from dashcalib_ros.store.scene_file import Origin, StoredTurn
 from dashcalib_ros.store.turn_store import TurnStore
@@ -23,8 +23,6 @@ NO_SCENE = ('its pictures gave no scene: too dark, blurred or empty to follow en
 UNCONFIRMED = 'this drive has no turn that could agree with it'
 # turns that wait for better ones; of KITTI 03 five are reconstructed then, not eight
 WAITING = 3
-# degrees of yaw; what has less is straight on
-BEND_DEG = 3.0
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,8 @@ ALONG = 0.98
 BAD_COST = 1.8
 # by which the road may turn a car about any axis
 BUMPS_DEG = 10.0
+# degrees of yaw; a stretch that has less is straight
+BEND_DEG = 3.0
 # px; wider pictures are made smaller: several of them go into one report
 PICTURE_WIDTH = 720
 # world to camera: rotation (3, 3), translation (3,)

@@ -25,7 +25,7 @@ from dashcalib_ros.problem.blocks import (
 )
 from dashcalib_ros.reconstruct.chain import CHAIN_ERROR
 from dashcalib_ros.reconstruct.heading import roll_deg
-from dashcalib_ros.reconstruct.scene import Profile, Scene, truncated_cost
+from dashcalib_ros.reconstruct.scene import BEND_DEG, Profile, Scene, truncated_cost
 from dashcalib_ros.solve.evidence import (
     HIDDEN_DEG,
     LARGE_FIELD,
@@ -380,7 +380,11 @@ def _solution(found: Estimate, unlike: Mapping[TurnId, float], coarse: Profile,
     result = written(found.imaging, posterior.covariance, found.scenes, config.model)
     scenes = tuple(result.seen(scene, found.imaging) for scene in found.scenes)
     progress('trying other focal lengths', 0.0)
-    around = profile_around(scenes, result.camera, coarse, config)
+    # beside a turn, straight stretches say little, and behind a windscreen something else
+    # (7001 of benchmark/thorough.py)
+    bends = [scene for scene in scenes if scene.yaw_deg >= BEND_DEG]
+    turn = any(scene.yaw_deg >= HIDDEN_DEG for scene in scenes)
+    around = profile_around(bends if turn else scenes, result.camera, coarse, config)
     count = len(result.camera.params)
     place, centred = found.imaging.places[Readout.name], found.centred
     shift = found.imaging.blocks.get(Shift.name, Shift())

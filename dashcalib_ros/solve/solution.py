@@ -95,7 +95,7 @@ class Solution:
     written camera alone would have seen them, in the order given. centred: the camera with one
     focal length that was found first, about which priors and bounds are; bounds: (2, n) lowest and
     highest values that were allowed. coarse: the sum of the turns' focal profiles; around: the
-    profile near the result, of all turns. readout_s: from the first row to the last, negative
+    profile near the result, of all bends. readout_s: from the first row to the last, negative
     where the last comes first; its standard deviation is readout_sigma_s. misfits: of every turn
     that was given: the ratio of its cost with this camera to its cost with its own camera. tried:
     the kinds of lenses that were compared. fixed_camera: the tests whether it is one, the clearest

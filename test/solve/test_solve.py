@@ -59,6 +59,21 @@ def good() -> Solution:
     return solved(scenes_of(3, outliers=0.03))
 
 
+def test_straight_stretches_beside_turns_say_nothing_about_other_focal_lengths(monkeypatch):
+    probed = []
+
+    def around(scenes, *others):
+        probed.append([scene.turn for scene in scenes])
+        return profile_around(scenes, *others)
+
+    monkeypatch.setattr(joint, 'profile_around', around)
+    turns = scenes_of(2, tracks=110, keyframes=9)
+    straight = synthetic_turn(LENS, 1.0, keyframes=9, tracks=110, world=9).scene(START, 2)
+    solution = solved([*turns, straight])
+    assert [scene.turn for scene in solution.scenes] == [at(0), at(1), at(2)]
+    assert probed == [[at(0), at(1)]]
+
+
 # the adjustment
 
 def built(scene: Scene, limits_px: Sequence[float] = (2.0, 2.0, 2.0)) -> Scene:
