@@ -557,13 +557,14 @@ def _median(values: Sequence[float], form: str = '.2f') -> str:
     return format(_quantile(values, 0.5), form) if values else ''
 
 
-def run(seed: int, out: Path, stage: str, again: bool, config: Config) -> None:
-    """Make what is missing of a seed."""
+def run(seed: int, out: Path, stage: str, again: bool, config: Config,
+        drive: Callable[[int], Drive] = drive_of) -> None:
+    """Make what is missing of a seed. drive: returns that of a seed."""
     scenes, result = out / f'{seed}.scenes.pkl', out / f'{seed}.json'
     if stage == 'all' and not again and done(load(result) or None):
         return
     if not scenes.exists():
-        outcome = isolated(_write_case, seed, config, scenes)
+        outcome = isolated(_write_case, drive, seed, config, scenes)
         complain(f'{seed}: {outcome.failure or outcome.value}, {outcome.seconds:.0f} s, '
                  f'{outcome.peak_mb:.0f} MB')
         if outcome.failure:
@@ -576,8 +577,8 @@ def run(seed: int, out: Path, stage: str, again: bool, config: Config) -> None:
         complain(f'{seed}: {row["verdict"]}, {outcome.seconds:.0f} s')
 
 
-def _write_case(seed: int, config: Config, path: Path) -> str:
-    case = reconstructed(drive_of(seed), config)
+def _write_case(drive: Callable[[int], Drive], seed: int, config: Config, path: Path) -> str:
+    case = reconstructed(drive(seed), config)
     save_case(case, path)
     return f'{len(case.scenes)} scenes of {len(case.spec.turn_list)} turns, {case.cpu_s:.0f} CPU s'
 
