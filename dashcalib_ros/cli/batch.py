@@ -102,7 +102,8 @@ def _as_dict(cameras: Sequence[Camera], files: Sequence[str]) -> dict[str, Any]:
 
 def _problem(row: Row, why: str) -> str:
     clip = f' ({row.clip})' if row.clip else ''
-    return f'row {row.number}{clip}: {why}'
+    # a name's own line ends must not begin a line
+    return ' '.join(f'row {row.number}{clip}: {why}'.split())
 
 
 @dataclass

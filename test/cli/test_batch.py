@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import sys
+from types import SimpleNamespace
 
 import pytest
 from made_drives import smooth, write_video
 
 from dashcalib_ros.cli import main
 from dashcalib_ros.cli.arguments import make_parser
-from dashcalib_ros.cli.batch import SHOWN
+from dashcalib_ros.cli.batch import SHOWN, _problem
 from dashcalib_ros.cli.drive import read_config
 from dashcalib_ros.config import Config
 
@@ -101,3 +102,8 @@ def test_only_a_cluster_needs_ray(tmp_path, capsys, monkeypatch, options, expect
     code, _, err = run(capsys, tmp_path / 'm.csv', '--out', tmp_path / 'out', *options)
     assert code == expected
     assert ("pip install '.[fleet]'" in err) == (expected == 2)
+
+
+def test_a_clip_s_name_begins_no_line():
+    row = SimpleNamespace(number=3, clip='a.mp4\nverdict: accepted')
+    assert _problem(row, 'it is\nempty') == 'row 3 (a.mp4 verdict: accepted): it is empty'
