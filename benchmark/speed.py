@@ -6,9 +6,8 @@
                               [--data DIR] [--minutes 60] [--cache DIR] [--out DIR]
 
 command: `dashcalib run` on KITTI 03's bag, from the file to the result. calibration: five turns of
-a rendered drive, stage by stage. length, turns: the whole of dashcalib on the same drive once,
-twice and four times over, and with 2 to 8 turns wanted; a long drive is a short one there and back
-again, so that no cut is in it. All these in seconds, processor seconds, and units: the processor
+a rendered drive, stage by stage. length, turns: the command on rendered drives of 5 to 40 turns,
+and with 2 to 8 turns wanted. All these in seconds, processor seconds, and units: the processor
 time of COLMAP's SIFT of 40 pictures, measured before and after each.
 detection: frames per second of a 30 fps camera on one core, by image size, thinning included and
 decoding apart; what tracking, epipoles and the rest take of it; JPEG decoding of the same frames.
@@ -31,13 +30,11 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 from drives import DEMO, FULL_HD, NARROW, STREET, VGA, Pictures, Setting, drive_of, pictures_of
 from measure import (
     SAMPLE_S,
     Outcome,
     Stopwatch,
-    calibrate,
     commit,
     complain,
     isolated,
@@ -62,14 +59,20 @@ from dashcalib_ros.input.scale import Scale
 ONE_TURN = replace(STREET, turns=1)
 SIZES = tuple(Setting(f'{lens.width}x{lens.height}', lens, ONE_TURN)
               for lens in (VGA, NARROW, FULL_HD))
-FIVE_TURNS = Setting('five turns', DEMO, replace(STREET, bonnet=True, timestamp=True))
 EIGHT_TURNS = Setting('eight turns', DEMO, replace(STREET, turns=8))
 RATE = 30.0
+AT_10_FPS = ('--fps', '10')
 # the estimator's methods, by what they do; one that is gone is not listed
 METHODS = {'track': '_follow', 'epipoles': '_magnitude',
            'new points': '_replenish', 'ego vehicle': '_look_for_ego'}
 PERIOD_S = 60.0
 PARTS = ('command', 'calibration', 'length', 'turns', 'detection', 'hour')
+
+
+def long_drive(turns: int) -> Setting:
+    """Return a drive of so many turns."""
+    return Setting(f'{turns} turns', DEMO,
+                   replace(STREET, turns=turns, bonnet=True, timestamp=True))
 
 
 def there_and_back(images: Sequence[Any], count: int, rate: float) -> Iterator[Frame]:
@@ -168,8 +171,8 @@ def hour(pictures: Pictures, minutes: float) -> dict[str, Any]:
             'turns': len(detector.bank.turns())}
 
 
-def command(bag: Path) -> dict[str, Any]:
-    """Run the command on a bag twice: for its times, and for its memory.
+def command(drive: Path, *options: str) -> dict[str, Any]:
+    """Run the command on a drive twice: for its times, and for its memory.
 
     To ask for the memory four times a second takes half a second of processor time.
     """
@@ -178,7 +181,8 @@ def command(bag: Path) -> dict[str, Any]:
         return used.ru_utime + used.ru_stime
 
     with tempfile.TemporaryDirectory() as folder:
-        line = [sys.executable, '-m', 'dashcalib_ros', 'run', str(bag), '--out', folder]
+        line = [sys.executable, '-m', 'dashcalib_ros', 'run', str(drive), '--out', folder,
+                *options]
         began, before, peak = time.perf_counter(), spent_s(), 0.0
         done = subprocess.run(line, capture_output=True, text=True, check=False)
         seconds, cpu_s = time.perf_counter() - began, spent_s() - before
@@ -217,18 +221,12 @@ def calibration(pictures: Pictures) -> dict[str, Any]:
             'verdict': result.verdict.level, 'used': sum(turn.used for turn in result.turns)}
 
 
-def whole(pictures: Pictures, times: int, turns: int) -> dict[str, Any]:
-    """Run all of dashcalib on the drive, so many times over (in a process of its own)."""
-    images = [cv2.imencode('.jpg', frame.image, (cv2.IMWRITE_JPEG_QUALITY, 95))[1]
-              for frame in pictures]
-    frames = (replace(frame, image=np.asarray(cv2.imdecode(frame.image, 0), np.uint8))
-              for frame in there_and_back(images, times * len(images), 10.0))
-    config = Config().replace({'turns.wanted': turns, 'turns.at_most': turns})
-    before = processor_s()
-    result, seconds = calibrate(frames, config)
-    return {'times': times, 'wanted': turns, 'frames': result.frames,
-            'seconds': seconds['total'], 'cpu_s': processor_s() - before,
-            'used': sum(turn.used for turn in result.turns), 'verdict': result.verdict.level}
+def as_images(pictures: Pictures, folder: Path) -> Path:
+    """Write a drive as a folder of JPEG images."""
+    folder.mkdir(exist_ok=True)
+    for frame in pictures:
+        cv2.imwrite(str(folder / f'{frame.index:06}.jpg'), frame.image)
+    return folder
 
 
 def measure(part: str, minutes: float, cache: Path, data: Path | None) -> dict[str, Any]:
@@ -252,14 +250,17 @@ def measure(part: str, minutes: float, cache: Path, data: Path | None) -> dict[s
     if part == 'command' and data is not None:
         add('`dashcalib run`, KITTI 03', command, data / 'kitti03' / 'bag')
     if part == 'calibration':
-        add('five turns, 960x540', calibration, pictures(FIVE_TURNS))
-    if part == 'length':
-        for times, name in ((1, 'a drive of five turns'), (2, 'twice as long'),
-                            (4, 'four times as long')):
-            add(name, whole, pictures(FIVE_TURNS), times, 5)
-    if part == 'turns':
-        for turns in (2, 5, 8):
-            add(f'{turns} of eight turns', whole, pictures(EIGHT_TURNS), 1, turns)
+        add('five turns, 960x540', calibration, pictures(long_drive(5)))
+    with tempfile.TemporaryDirectory() as folder:
+        if part == 'length':
+            for turns in (5, 10, 20, 40):
+                drive = as_images(pictures(long_drive(turns)), Path(folder, str(turns)))
+                add(f'a drive of {turns} turns', command, drive, *AT_10_FPS)
+        if part == 'turns':
+            drive = as_images(pictures(EIGHT_TURNS), Path(folder))
+            for turns in (2, 5, 8):
+                add(f'{turns} of eight turns', command, drive, *AT_10_FPS, '--set',
+                    f'turns.wanted={turns}', '--set', f'turns.at_most={turns}')
     if part == 'detection':
         for size in SIZES:
             add(size.name, detection, pictures(size), 60.0)

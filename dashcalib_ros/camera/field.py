@@ -72,6 +72,7 @@ def field_terms(pixels: Floats, image_size: tuple[int, int]) -> Floats:
     """Return (..., len(TERMS)) the values of all terms at pixels (..., 2)."""
     # the picture's edges are at -1 and 1
     places = ((pixels + 0.5) / np.array(image_size) * 2 - 1).clip(-BEYOND, BEYOND)
-    x, y = (legendre.legvander(places[..., axis], DEGREE) for axis in (0, 1))
+    # terms are the first axis inside: NumPy is slow where the last one is short
+    x, y = (np.moveaxis(legendre.legvander(places[..., axis], DEGREE), -1, 0) for axis in (0, 1))
     i, j = np.array(TERMS).T
-    return np.asarray(x[..., i] * y[..., j])
+    return np.moveaxis(x[i] * y[j], 0, -1)

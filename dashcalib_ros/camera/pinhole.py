@@ -84,25 +84,27 @@ class Radial(Camera):
         # of the scale by x over x, and by y over y
         slope = 2 * (k1 + square * (2 * k2 + 3 * k3 * square))
         across, sideways, downwards = 2 * x * y, square + 2 * x * x, square + 2 * y * y
-        by_params = np.zeros((len(points), 2, len(self.names())))
-        by_params[:, 0, 0] = x * scale + p1 * across + p2 * sideways
-        by_params[:, 1, 1] = y * scale + p1 * downwards + p2 * across
-        by_params[:, 0, 2] = by_params[:, 1, 3] = 1.0
-        pixels = by_params[:, [0, 1], [0, 1]] * [self.fx, self.fy] + [self.cx, self.cy]
-        radial = np.stack([self.fx * x, self.fy * y], axis=1) * square[:, None]
-        by_params[:, :, 4], by_params[:, :, 5] = radial, radial * square[:, None]
+        # points are the last axis: NumPy is slow where that is short
+        by_params = np.zeros((2, len(self.names()), len(points)))
+        by_params[0, 0] = x * scale + p1 * across + p2 * sideways
+        by_params[1, 1] = y * scale + p1 * downwards + p2 * across
+        by_params[0, 2] = by_params[1, 3] = 1.0
+        pixels = np.stack([self.fx * by_params[0, 0] + self.cx,
+                           self.fy * by_params[1, 1] + self.cy])
+        radial = np.stack([self.fx * x, self.fy * y]) * square
+        by_params[:, 4], by_params[:, 5] = radial, radial * square
         if len(self.names()) > 6:
-            by_params[:, 0, 6], by_params[:, 0, 7] = self.fx * across, self.fx * sideways
-            by_params[:, 1, 6], by_params[:, 1, 7] = self.fy * downwards, self.fy * across
-            by_params[:, :, 8] = radial * (square * square)[:, None]
+            by_params[0, 6], by_params[0, 7] = self.fx * across, self.fx * sideways
+            by_params[1, 6], by_params[1, 7] = self.fy * downwards, self.fy * across
+            by_params[:, 8] = radial * (square * square)
         both = across * slope / 2 + 2 * (p1 * x + p2 * y)
-        by_point = np.empty((len(points), 2, 3))
-        by_point[:, 0, 0] = scale + x * x * slope + 2 * p1 * y + 6 * p2 * x
-        by_point[:, 1, 1] = scale + y * y * slope + 6 * p1 * y + 2 * p2 * x
-        by_point[:, 0, 1] = by_point[:, 1, 0] = both
-        by_point[:, :, 2] = -(by_point[:, :, 0] * x[:, None] + by_point[:, :, 1] * y[:, None])
-        by_point *= inverse[:, None, None] * np.array([[self.fx], [self.fy]])
-        return by_params, by_point, pixels
+        by_point = np.empty((2, 3, len(points)))
+        by_point[0, 0] = scale + x * x * slope + 2 * p1 * y + 6 * p2 * x
+        by_point[1, 1] = scale + y * y * slope + 6 * p1 * y + 2 * p2 * x
+        by_point[0, 1] = by_point[1, 0] = both
+        by_point[:, 2] = -(by_point[:, 0] * x + by_point[:, 1] * y)
+        by_point *= inverse * np.array([[[self.fx]], [[self.fy]]])
+        return by_params.transpose(2, 0, 1), by_point.transpose(2, 0, 1), pixels.T
 
     def rays(self, pixels: Floats) -> Floats:
         """Return unit viewing rays (..., 3): Newton's method on the radius."""
@@ -165,6 +167,8 @@ class Brown(Radial):
             step = np.clip(np.nan_to_num(step), -0.5, 0.5)
             xy[moving] += step
             moving = moving[np.abs(step).max(axis=1, initial=0.0) > SETTLED]
+            if not len(moving):
+                break
         reached = np.linalg.norm(xy, axis=1) <= 1.02 * self.fold
         missed = np.abs(plain.project(np.column_stack([xy, np.ones(len(xy))]))
                         - wanted.reshape(-1, 2)).max(axis=1)

@@ -765,10 +765,10 @@ class Imaging:
             rotated[some] = points[some] @ structure.rotations[row].T
         still = rotated + structure.translations[rows]
         late = (observed.xy[:, 1] + 0.5) / self.camera.image_size[1] - 0.5
-        turning, moving = stretch.trajectory.velocity
-        shakes = self.of_images(Shake.name).get(stretch.turn)
         if Readout.name not in self.blocks:
             return Seen(stretch, observed, self, rotated, still, still, still * 0, still * 0, late)
+        turning, moving = stretch.trajectory.velocity
+        shakes = self.of_images(Shake.name).get(stretch.turn)
         turning = turning @ self.steering(stretch)
         by_readout = late[:, None] * (crossed(turning[rows], still) + moving[rows])
         turned, local = self.readout_s * turning[rows], still + self.readout_s * by_readout
