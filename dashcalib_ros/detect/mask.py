@@ -79,7 +79,7 @@ class EgoMask:
         half -= cv2.blur(half, (15, 15))
         x = cv2.Sobel(half, cv2.CV_32F, 1, 0, scale=0.125)
         y = cv2.Sobel(half, cv2.CV_32F, 0, 1, scale=0.125)
-        strength = cv2.magnitude(x, y)
+        strength = np.sqrt(x * x + y * y)  # see points.py about cv2.magnitude
         # an edge along the flow does not seem to move (lanes, kerbs, roofs): weigh by the angle
         direction = self._spread(flow / np.maximum(moves, 1e-6)[:, :, None])
         across = (x * direction[:, :, 0] + y * direction[:, :, 1]) / np.maximum(strength, 1e-6)

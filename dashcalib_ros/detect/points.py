@@ -57,7 +57,7 @@ def find_corners(image: GreyImage, present: Floats32, wanted: int,
     taken = np.zeros((height, width), np.uint8)
     there = np.clip(present / 2, 0, (width - 1, height - 1)).astype(int)
     taken[there[:, 1], there[:, 0]] = 1
-    strength = _corner_strength(image)
+    strength = corner_strength(image)
     spacing = max(2, round(SPACING * math.sqrt(height * width / wanted)))
     corner = (strength > 0) & (strength >= cv2.dilate(strength, _square(spacing // 2)))
     corner &= cv2.dilate(taken, _square(spacing - 1)) == 0
@@ -124,7 +124,7 @@ def _cells(places: npt.NDArray[Any], size: tuple[int, int], shape: tuple[int, ..
     return np.asarray(row * grid[0] + column)
 
 
-def _corner_strength(image: GreyImage) -> Floats32:
+def corner_strength(image: GreyImage) -> Floats32:
     """Return (height / 2, width / 2) twice the smaller eigenvalue of the gradients' covariance.
 
     The gradients are those of the full picture, which keeps its details; their products are
@@ -136,7 +136,9 @@ def _corner_strength(image: GreyImage) -> Floats32:
     xx, xy, yy = (cv2.blur(cv2.resize(cv2.multiply(a, b), (width, height),
                                       interpolation=cv2.INTER_AREA), (3, 3))
                   for a, b in ((x, x), (x, y), (y, y)))
-    return np.asarray(xx + yy - cv2.magnitude(xx - yy, xy + xy), np.float32)
+    # the last digit of cv2.magnitude depends on where an array lies in memory
+    apart, mixed = xx - yy, xy + xy
+    return np.asarray(xx + yy - np.sqrt(apart * apart + mixed * mixed), np.float32)
 
 
 def _square(reach: int) -> GreyImage:

@@ -8,7 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from dashcalib_ros.detect.points import Tracking, find_corners, follow_points
+from dashcalib_ros.detect.points import (
+    Tracking,
+    corner_strength,
+    find_corners,
+    follow_points,
+)
 
 WIDTH, HEIGHT = 640, 360
 NOTHING = np.zeros((0, 2), np.float32)
@@ -108,3 +113,18 @@ def test_the_number_of_threads_changes_nothing(threads):
     for moved, trusted in found[1:]:
         np.testing.assert_array_equal(moved, found[0][0])
         np.testing.assert_array_equal(trusted, found[0][1])
+
+
+@pytest.mark.parametrize('size', [(640, 360), (1242, 375), (414, 125)])
+def test_the_strength_of_corners_does_not_depend_on_where_arrays_lie_in_memory(size):
+    picture, rng, kept = street(*size), np.random.default_rng(0), []
+    for noise in range(1, 21):
+        noisy = np.clip(picture + rng.normal(0, noise, picture.shape), 0, 255).astype(np.uint8)
+        found = set()
+        for _ in range(12):
+            # other arrays come and go, and move those that are made next
+            kept.append(np.full(int(rng.integers(1000, 300000)), 1, np.uint8))
+            if len(kept) > 20:
+                kept.pop(int(rng.integers(20)))
+            found.add(corner_strength(noisy).tobytes())
+        assert len(found) == 1
