@@ -8,8 +8,8 @@
 kitti03 needs --data; the other names are settings of drives.py, with seed 0. The files are
 folders of the drive's pictures, without loss. They are cut between the turns that the whole drive
 uses, or in the middle of the first four of these; with so many seconds of images lost at each
-cut. 'not told' is one folder in which these images are missing: what a loss does that nobody
-notices. Rows go to DIR/joined.json as they come.
+cut. 'not told' is one folder in which these images are missing, and the others are numbered anew:
+what a loss does that the stamps hide. Rows go to DIR/joined.json as they come.
 
 --joints: instead, every fourth image of each drive is taken as the first of another file, after a
 loss of so many seconds, and as followed by an image of quite another place; how often it is said
@@ -22,7 +22,7 @@ import json
 import math
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -90,16 +90,20 @@ def cuts_of(turns: Iterable[tuple[int, bool, Any]], where: str) -> list[int]:
 
 def split(pictures: Sequence[Path], cuts: Sequence[int], lost: int, folder: Path, told: bool
           ) -> list[Path]:
-    """Link the pictures into folders; of each but the last, so many are lost at its end."""
+    """Link the pictures into folders; of each but the last, so many are lost at its end.
+
+    told: else into one folder, where they are numbered anew.
+    """
+    kept = [pictures[first:end - lost * (end != len(pictures))]
+            for first, end in pairwise([0, *cuts, len(pictures)])]
     parts = []
-    ends = [0, *cuts, len(pictures)]
-    for number, (first, end) in enumerate(pairwise(ends)):
-        part = folder / (f'{number}' if told else '0')
-        part.mkdir(parents=True, exist_ok=True)
-        for picture in pictures[first:end - lost * (end != len(pictures))]:
-            (part / picture.name).symlink_to(picture)
-        if part not in parts:
-            parts.append(part)
+    for number, some in enumerate(kept if told else [list(chain(*kept))]):
+        part = folder / f'{number}'
+        part.mkdir(parents=True)
+        for place, picture in enumerate(some):
+            name = picture.name if told else f'{place:06}{picture.suffix}'
+            (part / name).symlink_to(picture)
+        parts.append(part)
     return parts
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from dataclasses import field as default
 from functools import partial
@@ -54,6 +54,7 @@ from dashcalib_ros.judge.verdict import (
 )
 from dashcalib_ros.judge.witnesses import SensorComparison
 from dashcalib_ros.problem.blocks import Warmth
+from dashcalib_ros.problem.stamps import timed_by_path
 from dashcalib_ros.reconstruct.scene import Scene, TurnPicture, picture_of, rms_px
 from dashcalib_ros.solve.evidence import largest_crop
 from dashcalib_ros.solve.solution import Solution, cross_validation
@@ -114,8 +115,24 @@ def evidence_of_detection(detection: Detection, scenes: Iterable[Scene | None] =
         built=built, timing={},
         # the verdict says it
         warnings=(*(each for each in detection.warnings() if each.code != 'E-TWO-CAMERAS'),
-                  *lost),
+                  *_stamps(built.values()), *lost),
         other_camera=other, start_s=detection.start_s, lines=lines, straights=straights)
+
+
+def _stamps(scenes: Iterable[Scene]) -> Iterator[Notice]:
+    """Yield warnings where stamps do not say when images were taken."""
+    timed = timed_by_path(scenes)
+    if timed.frames:
+        yield Notice(
+            'E-TIME-MISSING', f'images are missing at {counted(len(timed.frames), "place")}, '
+            f'{timed.missing_s:.1f} s in all, the first after frame {min(timed.frames)}, and the '
+            f'stamps hide it; their time is taken from the speed of the car: record all images, '
+            f'or stamp each when it is taken')
+    if timed.inaccurate_s:
+        yield Notice(
+            'E-STAMPS-INACCURATE', f'the stamps are inaccurate by '
+            f'{1e3 * timed.inaccurate_s:.0f} ms (RMS), and the times are taken from the smooth '
+            f'motion of the car: stamp each image when it is taken, not when it arrives')
 
 
 def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> CalibrationData:

@@ -23,6 +23,7 @@ from dashcalib_ros.problem.blocks import (
     imaging_with,
     lens_like,
 )
+from dashcalib_ros.problem.stamps import timed_by_path
 from dashcalib_ros.reconstruct.chain import CHAIN_ERROR
 from dashcalib_ros.reconstruct.heading import roll_deg
 from dashcalib_ros.reconstruct.scene import BEND_DEG, Profile, Scene, truncated_cost
@@ -104,6 +105,7 @@ def solve(scenes: Sequence[Scene], config: Config, temperature: Samples | None =
     scenes: at least one, each as its turn was reconstructed. Turns of earlier drives that this
     drive's turns contradict are left out.
     """
+    scenes = timed_by_path(scenes).stretches
     try:
         found = _solved(scenes, config, progress, temperature)
         step_ns = None if found is None or found.drift is None else found.drift.step_ns
