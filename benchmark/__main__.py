@@ -64,7 +64,7 @@ PARTS = (
     Part('attacks', 150, 'videos that no fixed camera takes, and other bad ones'),
     Part('hostile', 40, 'power cuts, damaged files and messages, service calls; needs ROS'),
     Part('joined', 30, 'a drive in several files'),
-    Part('variable_rate', 15, 'videos of a variable rate'),
+    Part('variable_rate', 25, 'videos of a variable rate, and stamps of arrival'),
     Part('curves', 45, 'error over the number of turns and over the frame rate'),
     Part('ego_mask', 30, 'what the mask of the ego vehicle is worth'),
     Part('motion', 40, 'a gyro and GPS'),
