@@ -392,9 +392,10 @@ FIGURES = (
         found(r'\| kitti03 \| 10 \| 10 s \| not known \|.*? ± ([\d.]+) \|'),)),
     Figure(LIMITS, "the camera's height above the road it is # px", 'without_turns', (
         found(rf'\| kitti03 \| 10 \| 10 s \| {HEIGHT} \|.*? ± ([\d.]+) \|'),)),
-    Figure(LIMITS, 'fy was # sigma off, and the result was accepted (@)', 'joined', (
-        found(r'\| rolling shutter 20 ms \| inside turns \| 0.2, not told \|(?:[^|]*\|){4} '
-              r'([\d.]+)'),)),
+    Figure(LIMITS, 'the readout was # ms instead of 10, and fx # % off: accepted, with a '
+           'warning (@)', 'variable_rate', (
+               found(r'\| 10 ms, variable rate, by its mean \| accepted \| ([\d.]+) '
+                     r'[^|]*\|[^|]*\| [+-]([\d.]+) '),)),
     Figure(LIMITS, 'fx was up to # % and a parameter # sigma off (@)', 'attacks', tuple(
         cell('H.264, 0.03 bits per pixel', column) for column in (
             'worst fx % of those accepted', 'worst error, sigmas'))),
