@@ -188,6 +188,21 @@ def uncut(table: str) -> list[str]:
     return [str(sum({*cells[6:]} == {'0.00'} for cells in rows)), str(len(rows))]
 
 
+def hidden(table: str) -> list[str]:
+    """Return the drives that lost images which stamps hide, those accepted, and the worst sigma."""
+    rows = [cells for cells in rows_of(table) if len(cells) > 7 and cells[2].endswith('not told')]
+    return [str(len(rows)), str(sum(cells[4] == 'accepted' for cells in rows)),
+            max((each for cells in rows for each in cells[6:]), key=float)]
+
+
+def arrival(table: str) -> list[str]:
+    """Return how many readouts by stamps of arrival are within 2 sigma, of how many."""
+    rows = [cells for cells in rows_of(table) if 'arrival' in cells[0]]
+    found = [(float(cells[0].split()[0]), *map(float, cells[2].split(' ± '))) for cells in rows]
+    return [str(sum(abs(value - true) <= 2 * sigma for true, value, sigma in found)),
+            str(len(found))]
+
+
 def hostile(table: str) -> list[str]:
     """Return how many attacks held in each try, of how many."""
     rows = [cells[1] for cells in rows_of(table) if re.match(r'\d+ of|not tried', cells[1])]
@@ -345,6 +360,9 @@ FIGURES = (
         cell(name, 'height m (σ)', r'[\d.]+') for name in ('kitti03', 'kitti07'))),
     Figure(PROOF, '| # videos, # accepted, # of them wrong | @ |', 'attacks', (attacks,)),
     Figure(PROOF, '| # of # results are the same to the last digit | @ |', 'joined', (uncut,)),
+    Figure(PROOF, '| of # drives # are accepted, a parameter at most # sigma from the whole | @ |',
+           'joined', (hidden,)),
+    Figure(PROOF, '| # of # readouts within 2 sigma | @ |', 'variable_rate', (arrival,)),
     Figure(PROOF, '| # of # kinds of attack held in each try | @ |', 'hostile', (hostile,)),
     Figure(PROOF, '| accepted with 1, 2 and 5 turns: #, #, # of 3 | @ |', 'curves', tuple(
         cell(f'turns: {n}', 'accepted', r'^\d+') for n in (1, 2, 5))),
