@@ -189,7 +189,7 @@ def uncut(table: str) -> list[str]:
 
 
 def hidden(table: str) -> list[str]:
-    """Return the drives that lost images which stamps hide, those accepted, and the worst sigma."""
+    """Return the drives whose stamps hide a loss, those accepted, and the most sigmas."""
     rows = [cells for cells in rows_of(table) if len(cells) > 7 and cells[2].endswith('not told')]
     return [str(len(rows)), str(sum(cells[4] == 'accepted' for cells in rows)),
             max((each for cells in rows for each in cells[6:]), key=float)]
