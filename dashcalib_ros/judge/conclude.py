@@ -54,7 +54,7 @@ from dashcalib_ros.judge.verdict import (
 )
 from dashcalib_ros.judge.witnesses import SensorComparison
 from dashcalib_ros.problem.blocks import Warmth
-from dashcalib_ros.problem.stamps import timed_by_path
+from dashcalib_ros.problem.stamps import Times
 from dashcalib_ros.reconstruct.scene import Scene, TurnPicture, picture_of, rms_px
 from dashcalib_ros.solve.evidence import largest_crop
 from dashcalib_ros.solve.solution import Solution, cross_validation
@@ -115,24 +115,8 @@ def evidence_of_detection(detection: Detection, scenes: Iterable[Scene | None] =
         built=built, timing={},
         # the verdict says it
         warnings=(*(each for each in detection.warnings() if each.code != 'E-TWO-CAMERAS'),
-                  *_stamps(built.values()), *lost),
+                  *lost),
         other_camera=other, start_s=detection.start_s, lines=lines, straights=straights)
-
-
-def _stamps(scenes: Iterable[Scene]) -> Iterator[Notice]:
-    """Yield warnings where stamps do not say when images were taken."""
-    timed = timed_by_path(scenes)
-    if timed.frames:
-        yield Notice(
-            'E-TIME-MISSING', f'images are missing at {counted(len(timed.frames), "place")}, '
-            f'{timed.missing_s:.1f} s in all, the first after frame {min(timed.frames)}, and the '
-            f'stamps hide it; their time is taken from the speed of the car: record all images, '
-            f'or stamp each when it is taken')
-    if timed.inaccurate_s:
-        yield Notice(
-            'E-STAMPS-INACCURATE', f'the stamps are inaccurate by '
-            f'{1e3 * timed.inaccurate_s:.0f} ms (RMS), and the times are taken from the smooth '
-            f'motion of the car: stamp each image when it is taken, not when it arrives')
 
 
 def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> CalibrationData:
@@ -315,11 +299,26 @@ def _part(part: Solution | None, whole: Solution, later: int, evidence: Evidence
 REPORTED_FIELD_PX = 0.5
 
 
+def _stamps(times: Times) -> Iterator[Notice]:
+    """Yield warnings where stamps do not say when images were taken."""
+    if times.frames:
+        yield Notice(
+            'E-TIME-MISSING', f'images are missing at {counted(len(times.frames), "place")}, '
+            f'{times.missing_s:.1f} s in all, the first after frame {min(times.frames)}, and the '
+            f'stamps hide it; their time is taken from the speed of the car: record all images, '
+            f'or stamp each when it is taken')
+    if times.inaccurate_s:
+        yield Notice(
+            'E-STAMPS-INACCURATE', f'the stamps are inaccurate by '
+            f'{1e3 * times.inaccurate_s:.0f} ms (RMS), and the times are taken from the smooth '
+            f'motion of the car: stamp each image when it is taken, not when it arrives')
+
+
 def _warnings(found: CalibrationData, solution: Solution, evidence: Evidence
               ) -> tuple[Notice, ...]:
     """Return what the user must know about the numbers, which does not change the verdict."""
     level, model, field = found.verdict.level, found.config.model, found.field
-    warnings = []
+    warnings = list(_stamps(solution.times))
     if evidence.temperature is not None and _warmth(solution, evidence) is None:
         warnings.append(Notice(
             'E-TEMPERATURE-TIMES', 'the temperature is not used: it was not measured at the times '

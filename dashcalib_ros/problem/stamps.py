@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -33,34 +33,33 @@ S = TypeVar('S', bound=Stretch)
 
 
 @dataclass(frozen=True)
-class Timed(Generic[S]):
-    """Stretches with the times that their paths say, where stamps do not.
+class Times:
+    """What the stamps of images do not say.
 
-    frames: after which images are missing, and stamps hide it; missing_s: all of that time.
+    frames: those after which images are missing while stamps hide it; missing_s: all of that time.
     inaccurate_s: spread of the stamps that were replaced; 0 for none.
     """
 
-    stretches: list[S]
-    frames: list[int]
-    missing_s: float
+    frames: tuple[int, ...] = ()
+    missing_s: float = 0.0
     inaccurate_s: float = 0.0
 
 
-def timed_by_path(stretches: Iterable[S]) -> Timed[S]:
+def timed_by_path(stretches: Iterable[S]) -> tuple[list[S], Times]:
     """Return the stretches with the times that their paths say, where stamps do not."""
-    found = Timed(list[S](), list[int](), 0.0)
+    found, frames, missing = list[S](), list[int](), 0.0
     for stretch in stretches:
         path = stretch.trajectory
         hidden = missing_s(path)
-        found = Timed([*found.stretches, _later(stretch, np.cumsum([0.0, *hidden]))],
-                      found.frames + stretch.tracks.frames[path.rows[:-1][hidden > 0]].tolist(),
-                      found.missing_s + float(hidden.sum()))
-    late = [inaccurate_s(stretch.trajectory) for stretch in found.stretches]
+        found.append(_later(stretch, np.cumsum([0.0, *hidden])))
+        frames += stretch.tracks.frames[path.rows[:-1][hidden > 0]].tolist()
+        missing += float(hidden.sum())
+    late = [inaccurate_s(stretch.trajectory) for stretch in found]
     spread = float(np.median([each for _, each in late])) if late else 0.0
-    return found if spread < INACCURATE_S else replace(
-        found, inaccurate_s=spread, stretches=[
-            _later(stretch, -late_s)
-            for stretch, (late_s, _) in zip(found.stretches, late, strict=True)])
+    if spread < INACCURATE_S:
+        return found, Times(tuple(frames), missing)
+    return [_later(stretch, -late_s) for stretch, (late_s, _) in zip(found, late, strict=True)
+            ], Times(tuple(frames), missing, spread)
 
 
 def missing_s(path: Trajectory) -> Floats:

@@ -105,11 +105,13 @@ def solve(scenes: Sequence[Scene], config: Config, temperature: Samples | None =
     scenes: at least one, each as its turn was reconstructed. Turns of earlier drives that this
     drive's turns contradict are left out.
     """
-    scenes = timed_by_path(scenes).stretches
+    scenes, times = timed_by_path(scenes)
     try:
         found = _solved(scenes, config, progress, temperature)
-        step_ns = None if found is None or found.drift is None else found.drift.step_ns
-        return found if found is None or step_ns is None else replace(found, parts=tuple(
+        if found is None:
+            return None
+        step_ns = None if found.drift is None else found.drift.step_ns
+        return replace(found, times=times, parts=() if step_ns is None else tuple(
             _part(scenes, config, step_ns, later) for later in (False, True)))
     except np.linalg.LinAlgError:
         # nothing limits a direction of the parameters: pictures that slide past show no depth

@@ -14,6 +14,7 @@ from dashcalib_ros.camera.field import Field
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.problem.blocks import Drift, lens_alone, middle
 from dashcalib_ros.problem.quadratic import NONE, Quadratic
+from dashcalib_ros.problem.stamps import Times
 from dashcalib_ros.reconstruct.scene import Profile, Scene, rms_px
 from dashcalib_ros.solve.evidence import Candidate, FixedCameraTest
 from dashcalib_ros.solve.spread import PictureSigma, Posterior, SigmaMap, sigma_over
@@ -107,7 +108,8 @@ class Solution:
     those later. unsettled: how far the last step moved the rays over the picture, in their sigma.
     field_sigma: px, of the prior of the field's directions. by_pictures: the solution of the
     pictures alone, where a gyro's angles are in this one; by_turns: the one before what somebody
-    knew about the camera was used. px: of the input's pictures, in one pixel of the scenes.
+    knew about the camera was used. px: of the input's pictures, in one pixel of the scenes. times:
+    what the stamps of the scenes as given do not say.
     """
 
     written: Written
@@ -132,6 +134,7 @@ class Solution:
     by_pictures: Solution | None = None
     by_turns: Solution | None = None
     px: float = 1.0
+    times: Times = default(default_factory=Times)
 
     @property
     def camera(self) -> Camera:

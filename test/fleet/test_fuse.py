@@ -201,3 +201,20 @@ def test_nothing_to_solve_is_refused_with_the_reason(clips, code):
     found = fuse('cam', 'acme', clips, CONFIG)
     assert found.estimate is None and found.calibration.verdict.level == 'refused'
     assert found.calibration.verdict.codes[0] == code
+
+
+def test_stamps_that_hide_a_loss_are_named():
+    clips = {}
+    for n in range(3):
+        clip = clip_of(yaws=YAWS[n:n + 1], world=n, tracks=80, keyframes=14)
+        [turn] = clip.turns
+        tracks = turn.scene.tracks
+        step_ns = np.diff(tracks.stamps_ns).min()
+        later = np.where(np.arange(len(tracks.frames)) > 6, step_ns // 2, 0)
+        tracks = replace(tracks, stamps_ns=tracks.stamps_ns - later)
+        clips[f'{n}.mp4'] = replace(clip, turns=(
+            replace(turn, scene=replace(turn.scene, tracks=tracks)),))
+    found = fuse('cam', 'acme', clips, CONFIG).calibration
+    assert 'E-TIME-MISSING' in {each.code for each in found.warnings}
+    sound = fuse('cam', 'acme', CLIPS, CONFIG).calibration
+    assert 'E-TIME-MISSING' not in {each.code for each in sound.warnings}

@@ -42,6 +42,7 @@ def test_images_are_missing_and_the_stamps_hide_it():
     found = solved(scenes)
     assert abs(found.readout_s - 0.02) < 2.5 * found.readout_sigma_s < 0.06 * 0.02
     assert np.abs(z_of(found)).max() < 3
+    assert len(found.times.frames) == 3 and found.times.missing_s == pytest.approx(0.3, abs=0.03)
 
 
 def test_stamps_of_arrival():
@@ -53,6 +54,7 @@ def test_stamps_of_arrival():
     found = solved(scenes)
     assert abs(found.readout_s - 0.02) < 2.5 * found.readout_sigma_s < 0.06 * 0.02
     assert np.abs(z_of(found)).max() < 3
+    assert not found.times.frames and found.times.inaccurate_s == pytest.approx(0.01, rel=0.3)
 
 
 def test_bumps_between_the_keyframes_do_not_make_a_readout_shorter():
